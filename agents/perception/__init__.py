@@ -1,0 +1,1 @@
+"""From one robot's observation to detections."""

@@ -1,0 +1,1 @@
+"""Worlds, cameras, scoring and the PettingZoo environments."""

@@ -1,0 +1,1 @@
+"""Cameras: one software rasteriser, and pybullet's renderers beside it."""

@@ -1,0 +1,1 @@
+"""Simulators behind one protocol, with no PettingZoo in them."""

@@ -1,0 +1,1 @@
+"""Datasets, runners, statistics and reports."""

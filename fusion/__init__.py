@@ -1,0 +1,1 @@
+"""Where it is: fusing the robots' measurements of the same object."""

@@ -1,0 +1,141 @@
+"""Rigid motions and their uncertainty.
+
+A pose `T_a_b` (4, 4) maps coordinates of frame b to frame a, in metres. Its covariance (6, 6) is ordered
+[translation, rotation] and perturbs on the right: T = T_hat exp(xi), xi ~ N(0, covariance); the translation part of xi
+is thus expressed in frame b.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+ROTATION_TOLERANCE = 1e-3
+
+
+def skew(v: Array) -> Array:
+    """Matrix (3, 3) with skew(v) @ w = cross(v, w)."""
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+def rotation_from_vector(w: Array) -> Array:
+    """Rotation (3, 3) about the axis w by the angle |w| in radians (Rodrigues)."""
+    angle = float(np.linalg.norm(w))
+    K = skew(np.asarray(w, dtype=np.float64))
+    if angle < 1e-8:
+        return np.eye(3) + K + 0.5 * K @ K
+    return np.eye(3) + np.sin(angle) / angle * K + (1.0 - np.cos(angle)) / angle**2 * K @ K
+
+
+def exp_se3(xi: Array) -> Array:
+    """Pose (4, 4) of the twist xi (6,) = [translation m, rotation rad]; to first order, translation and rotation apart."""
+    T = np.eye(4)
+    T[:3, :3] = rotation_from_vector(xi[3:])
+    T[:3, 3] = xi[:3]
+    return T
+
+
+def invert(T_a_b: Array) -> Array:
+    """T_b_a (4, 4)."""
+    T = np.eye(4)
+    T[:3, :3] = T_a_b[:3, :3].T
+    T[:3, 3] = -T_a_b[:3, :3].T @ T_a_b[:3, 3]
+    return T
+
+
+def transform(T_a_b: Array, positions_b: Array) -> Array:
+    """Positions (n, 3) m of frame b, in frame a."""
+    return positions_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+
+
+def adjoint(T_a_b: Array) -> Array:
+    """Adjoint (6, 6), order [translation, rotation]: exp(adjoint(T) xi) = T exp(xi) T^-1."""
+    R, t = T_a_b[:3, :3], T_a_b[:3, 3]
+    out = np.zeros((6, 6))
+    out[:3, :3] = R
+    out[3:, 3:] = R
+    out[:3, 3:] = skew(t) @ R
+    return out
+
+
+def check_pose(T: Array, name: str) -> Array:
+    """The pose as float64 (4, 4). Raises ValueError naming `name` unless it is a finite rigid motion."""
+    T = np.asarray(T, dtype=np.float64)
+    if T.shape != (4, 4):
+        raise ValueError(f"{name} must have shape (4, 4), got {T.shape}")
+    if not np.isfinite(T).all():
+        raise ValueError(f"{name} must be finite, got\n{T}")
+    R = T[:3, :3]
+    error = float(np.abs(R @ R.T - np.eye(3)).max())
+    if error > ROTATION_TOLERANCE or np.linalg.det(R) < 0 or not np.allclose(T[3], (0, 0, 0, 1)):
+        raise ValueError(f"{name} is not a rigid motion: |R R^T - I| = {error:.2g}, det R = {np.linalg.det(R):.3g}")
+    return T
+
+
+def check_covariance(covariance: Array, name: str, size: int = 6) -> Array:
+    """The covariance as float64 (size, size). Raises ValueError naming `name` unless finite, symmetric and positive semidefinite."""
+    covariance = np.asarray(covariance, dtype=np.float64)
+    if covariance.shape != (size, size):
+        raise ValueError(f"{name} must have shape ({size}, {size}), got {covariance.shape}")
+    if not np.isfinite(covariance).all():
+        raise ValueError(f"{name} must be finite")
+    scale = max(float(np.abs(covariance).max()), 1e-12)
+    if np.abs(covariance - covariance.T).max() > 1e-6 * scale:
+        raise ValueError(f"{name} must be symmetric")
+    lowest = float(np.linalg.eigvalsh(covariance)[0])
+    if lowest < -1e-6 * scale:
+        raise ValueError(f"{name} must be positive semidefinite, its lowest eigenvalue is {lowest:.3g}")
+    return covariance
+
+
+@dataclass(frozen=True)
+class RelativePose:
+    """Noisy pose of the target robot's sensor in the source robot's sensor frame: the `prior` of a matcher.
+
+    Attributes:
+        T_source_target: (4, 4), target sensor frame to source sensor frame, m.
+        covariance: (6, 6), [translation m^2, rotation rad^2], right perturbation.
+
+    Raises:
+        ValueError: not a rigid motion, or not a covariance.
+    """
+
+    T_source_target: Array
+    covariance: Array
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "T_source_target", check_pose(self.T_source_target, "T_source_target"))
+        object.__setattr__(self, "covariance", check_covariance(self.covariance, "covariance of T_source_target"))
+
+    @classmethod
+    def between(
+        cls, T_world_source: Array, covariance_source: Array, T_world_target: Array, covariance_target: Array
+    ) -> RelativePose:
+        """Relative pose of two independent world poses, covariances (6, 6) each propagated to first order."""
+        T = invert(T_world_source) @ T_world_target
+        to_target = adjoint(invert(T))
+        return cls(T, covariance_target + to_target @ covariance_source @ to_target.T)
+
+    def inverse(self) -> RelativePose:
+        """The same knowledge with source and target exchanged."""
+        Ad = adjoint(self.T_source_target)
+        return RelativePose(invert(self.T_source_target), Ad @ self.covariance @ Ad.T)
+
+    def position_covariances(self, positions: Array) -> Array:
+        """Covariance (n, 3, 3) m^2, source axes, that the pose's error gives target positions (n, 3) m mapped to the source."""
+        R = self.T_source_target[:3, :3]
+        J = np.zeros((len(positions), 3, 6))
+        J[:, :, :3] = R
+        J[:, :, 3:] = -R @ _skews(positions)
+        return J @ self.covariance @ J.transpose(0, 2, 1)
+
+
+def _skews(v: Array) -> Array:
+    out = np.zeros((len(v), 3, 3))
+    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
+    out[:, 1, 0], out[:, 2, 0], out[:, 2, 1] = v[:, 2], -v[:, 1], v[:, 0]
+    return out

@@ -1,0 +1,56 @@
+"""From a name to a matcher: built in, installed by another package, or anywhere as `package.module:callable`."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from importlib.metadata import entry_points
+
+from .graph import Matcher
+from .hungarian import hungarian
+from .reid import reid
+
+METHODS: dict[str, Matcher] = {
+    "hungarian": hungarian,
+    "reid": reid,
+}
+
+ENTRY_POINT_GROUP = "covis.matchers"
+
+
+class UnknownMatcherError(ValueError):
+    """No matcher of that name."""
+
+
+def load_matcher(name: str) -> Matcher:
+    """The matcher called `name`: in METHODS, in the entry-point group `covis.matchers`, or `package.module:callable`.
+
+    Raises:
+        UnknownMatcherError: there is none, or it is not callable; the message lists the known names.
+    """
+    if name in METHODS:
+        return METHODS[name]
+    installed = {point.name: point for point in entry_points(group=ENTRY_POINT_GROUP)}
+    if name in installed:
+        return _callable(installed[name].load(), name)
+    if ":" in name:
+        return _callable(_import(name), name)
+    known = ", ".join(sorted({*METHODS, *installed}))
+    raise UnknownMatcherError(f"no matcher is called {name!r}; known are {known}, or package.module:callable")
+
+
+def _import(name: str) -> object:
+    module_name, _, attribute = name.partition(":")
+    try:
+        module = import_module(module_name)
+    except ImportError as error:
+        raise UnknownMatcherError(f"cannot import {module_name!r} of matcher {name!r}: {error}") from error
+    try:
+        return getattr(module, attribute)
+    except AttributeError as error:
+        raise UnknownMatcherError(f"module {module_name!r} has no {attribute!r} (matcher {name!r})") from error
+
+
+def _callable(candidate: object, name: str) -> Matcher:
+    if not callable(candidate):
+        raise UnknownMatcherError(f"{name!r} is not callable: {candidate!r}")
+    return candidate
