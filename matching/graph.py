@@ -224,7 +224,7 @@ class Matching:
 
 
 Matcher = Callable[..., Matching]
-"""`(source: ObjectGraph, target: ObjectGraph, *, prior: RelativePose | None = None, rng: Generator | None = None, **options)`.
+"""`(source, target, *, prior: RelativePose | None = None, rng: numpy Generator | None = None, **options) -> Matching`.
 
 Without an `rng` a stochastic matcher draws from `default_rng(0)`, so that the same call gives the same answer.
 """

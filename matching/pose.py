@@ -32,7 +32,7 @@ def rotation_from_vector(w: Array) -> Array:
 
 
 def exp_se3(xi: Array) -> Array:
-    """Pose (4, 4) of the twist xi (6,) = [translation m, rotation rad]; to first order, translation and rotation apart."""
+    """Pose (4, 4) of xi (6,) = [translation m, rotation rad], the translation taken as it is (first order)."""
     T = np.eye(4)
     T[:3, :3] = rotation_from_vector(xi[3:])
     T[:3, 3] = xi[:3]
@@ -77,7 +77,7 @@ def check_pose(T: Array, name: str) -> Array:
 
 
 def check_covariance(covariance: Array, name: str, size: int = 6) -> Array:
-    """The covariance as float64 (size, size). Raises ValueError naming `name` unless finite, symmetric and positive semidefinite."""
+    """As float64 (size, size). Raises ValueError naming `name` unless finite, symmetric and positive semidefinite."""
     covariance = np.asarray(covariance, dtype=np.float64)
     if covariance.shape != (size, size):
         raise ValueError(f"{name} must have shape ({size}, {size}), got {covariance.shape}")
@@ -126,7 +126,7 @@ class RelativePose:
         return RelativePose(invert(self.T_source_target), Ad @ self.covariance @ Ad.T)
 
     def position_covariances(self, positions: Array) -> Array:
-        """Covariance (n, 3, 3) m^2, source axes, that the pose's error gives target positions (n, 3) m mapped to the source."""
+        """Covariance (n, 3, 3) m^2, source axes, that the pose's error gives to mapped target positions (n, 3) m."""
         R = self.T_source_target[:3, :3]
         J = np.zeros((len(positions), 3, 6))
         J[:, :, :3] = R

@@ -131,7 +131,7 @@ class World(Protocol):
     ends_on_collision: bool
 
     def reset(self, rng: np.random.Generator) -> None:
-        """Generate a new scene from `rng` alone. Raises SceneGenerationError when no valid scene was found in bounded tries."""
+        """Generate a new scene from `rng` alone. Raises SceneGenerationError when no valid one was found in bounded tries."""
 
     def step(self, controls: Array) -> None:
         """Advance by `step_seconds` under controls (N, d) in [-1, 1]."""
@@ -144,4 +144,4 @@ class World(Protocol):
 
 
 class SceneGenerationError(RuntimeError):
-    """No scene satisfying the parameters was found within the bounded number of tries; the message says which failed."""
+    """No scene satisfying the parameters was found within the bounded number of tries; the message says why."""

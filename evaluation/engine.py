@@ -1,0 +1,183 @@
+"""Work units and the local engine: a benchmark run is a list of units, each a chunk of episodes times all methods.
+
+A unit's records depend on nothing but the unit, so that serial, parallel and resumed runs agree bit for bit. With an
+output folder each finished unit becomes one Parquet shard by an atomic rename; a resumed run skips the shards it finds.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+
+from .datasets import Dataset, load_dataset
+from .methods import Method
+from .records import Record, from_table, to_table
+from .run_dataset import run_episodes
+from .settings import Settings
+
+FRAMES_PER_UNIT = 100
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A chunk of episodes of one target. `kind` is `dataset` (target = folder) or `scene` (target = name)."""
+
+    kind: str
+    target: str
+    episodes: tuple[int, ...]
+
+
+def dataset_units(path: str, settings: Settings) -> list[Unit]:
+    """Whole episodes, chunked to about FRAMES_PER_UNIT frames."""
+    dataset = _dataset(path, settings.seed)
+    chunk: list[int] = []
+    size = 0
+    units: list[Unit] = []
+    episodes, frames = _episode_sizes(dataset)
+    for episode, n in list(zip(episodes, frames, strict=True))[: settings.episodes]:
+        chunk.append(episode)
+        size += n
+        if size >= FRAMES_PER_UNIT:
+            units.append(Unit("dataset", path, tuple(chunk)))
+            chunk, size = [], 0
+    if chunk:
+        units.append(Unit("dataset", path, tuple(chunk)))
+    return units
+
+
+def run_unit(unit: Unit, methods: Sequence[Method], settings: Settings) -> list[Record]:
+    if unit.kind == "dataset":
+        return run_episodes(_dataset(unit.target, settings.seed), unit.episodes, methods, settings)
+    raise ValueError(f"unknown kind of unit {unit.kind!r}")
+
+
+def run(
+    units: Sequence[Unit],
+    methods: Sequence[Method],
+    settings: Settings,
+    *,
+    workers: int = 1,
+    out: Path | None = None,
+    resume: bool = False,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Record]:
+    """All records, in the order of the units.
+
+    Args:
+        units: the work.
+        workers: processes; 1 runs here.
+        out: folder for shards and run.json; None keeps everything in memory.
+        resume: skip units whose shard is there.
+        progress: called with (units done, units in all).
+
+    Raises:
+        FileExistsError: `out` holds another run, or holds this one and `resume` is off.
+        ValueError: fewer than one worker.
+    """
+    if workers < 1:
+        raise ValueError(f"workers must be at least 1, got {workers}")
+    shards = None if out is None else Shards.open(out, units, methods, settings, resume)
+    results: dict[int, list[Record]] = {} if shards is None else shards.finished()
+    progress(len(results), len(units))
+    todo = [i for i in range(len(units)) if i not in results]
+    for number, records in _execute(todo, units, methods, settings, workers):
+        if shards is not None:
+            shards.write(number, records)
+        results[number] = records
+        progress(len(results), len(units))
+    return [record for number in sorted(results) for record in results[number]]
+
+
+def _execute(
+    todo: Sequence[int], units: Sequence[Unit], methods: Sequence[Method], settings: Settings, workers: int
+) -> Iterator[tuple[int, list[Record]]]:
+    if workers == 1:
+        for i in todo:
+            yield i, run_unit(units[i], methods, settings)
+        return
+    # Spawned, not forked: Numba's and pybullet's state does not survive a fork.
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        futures = {pool.submit(run_unit, units[i], methods, settings): i for i in todo}
+        try:
+            for future in as_completed(futures):
+                yield futures[future], future.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+@dataclass(frozen=True)
+class Shards:
+    """The output folder of one run."""
+
+    folder: Path
+    n: int
+
+    @classmethod
+    def open(
+        cls, out: Path, units: Sequence[Unit], methods: Sequence[Method], settings: Settings, resume: bool
+    ) -> Shards:
+        config = {
+            "units": [asdict(u) for u in units],
+            "methods": [m.label for m in methods],
+            "settings": asdict(settings),
+        }
+        folder = out / "records"
+        file = out / "run.json"
+        if file.exists():
+            if json.loads(file.read_text()) != json.loads(json.dumps(config)):
+                raise FileExistsError(
+                    f"{out} holds a run with other targets, methods or settings; choose another --out"
+                )
+            if not resume:
+                raise FileExistsError(f"{out} holds this run already; give --resume to go on with it")
+        folder.mkdir(parents=True, exist_ok=True)
+        write_atomically(file, json.dumps(config, indent=1).encode())
+        return cls(folder, len(units))
+
+    def finished(self) -> dict[int, list[Record]]:
+        return {i: from_table(pq.read_table(self._file(i))) for i in range(self.n) if self._file(i).exists()}
+
+    def write(self, number: int, records: Sequence[Record]) -> None:
+        temporary = self._file(number).with_suffix(f".{os.getpid()}.tmp")
+        pq.write_table(to_table(records), temporary)
+        os.replace(temporary, self._file(number))
+
+    def _file(self, number: int) -> Path:
+        return self.folder / f"unit-{number:05d}.parquet"
+
+
+def write_atomically(file: Path, content: bytes) -> None:
+    temporary = file.with_name(f"{file.name}.{os.getpid()}.tmp")
+    temporary.write_bytes(content)
+    os.replace(temporary, file)
+
+
+def _episode_sizes(dataset: Dataset) -> tuple[list[int], list[int]]:
+    sizes: dict[int, int] = {}
+    for episode in dataset.episode.tolist():
+        sizes[episode] = sizes.get(episode, 0) + 1
+    return list(sizes), list(sizes.values())
+
+
+@lru_cache(maxsize=4)
+def _dataset(path: str, seed: int) -> Dataset:
+    return load_dataset(path, seed)
+
+
+def target_name(unit: Unit, settings: Settings) -> str:
+    """The name rows carry: a dataset's own, a scene's."""
+    return _dataset(unit.target, settings.seed).name if unit.kind == "dataset" else unit.target
+
+
+def describe(methods: Sequence[Method], settings: Settings) -> list[dict[str, Any]]:
+    return [{"method": m.name, "options": dict(m.options), "pose": settings.pose} for m in methods]

@@ -1,0 +1,61 @@
+"""One matcher on one pair of views: what every runner does at its core."""
+
+from __future__ import annotations
+
+import zlib
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..matching import Matching, ObjectGraph, PriorRequiredError, RelativePose
+from .methods import Method, oracle, random_matching
+
+
+class MatcherFailedError(RuntimeError):
+    """A matcher raised on a pair; the message says which method, where, and why."""
+
+
+def match_pair(
+    method: Method,
+    source: ObjectGraph,
+    target: ObjectGraph,
+    identities: tuple[NDArray[np.int64], NDArray[np.int64]],
+    prior: RelativePose | None,
+    stream: tuple[int, ...],
+    where: str,
+) -> tuple[Matching, float]:
+    """The matching and the time it took, ms.
+
+    `identities` serve the evaluation-only baselines alone. `stream` seeds the matcher's generator, together with the
+    method's name, so that results depend on neither the order of methods nor the number of workers.
+
+    Raises:
+        PriorRequiredError: the method needs a prior.
+        MatcherFailedError: anything else the method raised, or a result that does not fit the graphs.
+    """
+    if method.name == "oracle":
+        return oracle(*identities), 0.0
+    rng = np.random.default_rng([*stream, zlib.crc32(method.label.encode())])
+    if method.name == "random":
+        return random_matching(len(source), len(target), rng), 0.0
+    matcher = method.load()
+    assert matcher is not None
+    start = perf_counter()
+    try:
+        matching = matcher(source, target, prior=prior, rng=rng, **method.options)
+    except PriorRequiredError:
+        raise
+    except Exception as error:
+        raise MatcherFailedError(
+            f"method {method.label!r} failed on {where}: {type(error).__name__}: {error}"
+        ) from error
+    elapsed = 1e3 * (perf_counter() - start)
+    if not isinstance(matching, Matching):
+        raise MatcherFailedError(f"method {method.label!r} returned {type(matching).__name__}, not a Matching")
+    if len(matching) and (matching.pairs.max(axis=0) >= (len(source), len(target))).any():
+        raise MatcherFailedError(
+            f"method {method.label!r} on {where}: pairs name index {matching.pairs.max(axis=0).tolist()}, "
+            f"the graphs have {len(source)} and {len(target)} objects"
+        )
+    return matching, elapsed

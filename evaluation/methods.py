@@ -1,0 +1,75 @@
+"""From the text of `--method` to something the runner can call, evaluation-only baselines included."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..matching import Matcher, Matching, load_matcher
+
+EVALUATION_ONLY = ("oracle", "random")
+
+
+@dataclass(frozen=True)
+class Method:
+    """A matcher by name, with its options. `label` is the text it came from."""
+
+    label: str
+    name: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def parse(cls, text: str) -> Method:
+        """`name`, `name:option=value,...`, `package.module:callable` or `package.module:callable:option=value,...`.
+
+        Raises:
+            ValueError: an empty name or a malformed option.
+        """
+        head, separator, tail = text.rpartition(":")
+        name, options = (head, tail) if separator and "=" in tail else (text, "")
+        if not name:
+            raise ValueError(f"--method {text!r} names no method")
+        return cls(text, name, _options(options, text))
+
+    def load(self) -> Matcher | None:
+        """The matcher, or None for the evaluation-only baselines, which need the truth."""
+        return None if self.name in EVALUATION_ONLY else load_matcher(self.name)
+
+
+def oracle(source_identity: NDArray[np.int64], target_identity: NDArray[np.int64]) -> Matching:
+    """The true matching of two views: every detection of an object that both detected."""
+    common, i, j = np.intersect1d(source_identity, target_identity, return_indices=True)
+    real = common >= 0
+    return Matching(np.stack([i[real], j[real]], axis=1), np.ones(int(real.sum())))
+
+
+def random_matching(n: int, m: int, rng: np.random.Generator) -> Matching:
+    """As many matches as fit between n and m detections, drawn uniformly; each is right by chance 1/max(n, m) at most."""
+    k = min(n, m)
+    if k == 0:
+        return Matching.empty()
+    pairs = np.stack([rng.permutation(n)[:k], rng.permutation(m)[:k]], axis=1)
+    return Matching(pairs, np.full(k, 1.0 / max(n, m)))
+
+
+def _options(text: str, whole: str) -> dict[str, Any]:
+    options: dict[str, Any] = {}
+    for part in filter(None, text.split(",")):
+        key, separator, value = part.partition("=")
+        if not separator or not key.isidentifier():
+            raise ValueError(f"--method {whole!r}: {part!r} is not option=value")
+        options[key] = _value(value)
+    return options
+
+
+def _value(text: str) -> Any:
+    """A Python literal where it is one, else the text itself."""
+    try:
+        return ast.literal_eval(text)
+    except (ValueError, SyntaxError):
+        return {"true": True, "false": False, "none": None}.get(text.lower(), text)

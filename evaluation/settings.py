@@ -1,0 +1,47 @@
+"""What a benchmark run is asked to do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+PoseKnowledge = Literal["unknown", "known"]
+Perception = Literal["simulated", "learned"]
+
+MIN_DETECTIONS = 3
+"""Both views of a pair need at least this many detections to count as a pair."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Options of a run, the same for every target and method.
+
+    Attributes:
+        pose: `known` hands the noisy relative pose to the matcher as prior.
+        preset: difficulty of scenes; None = the scene's own default.
+        min_common: pairs with fewer common objects are left out.
+        sequence: carry a tracker's state through each episode and pass it as prior.
+        seed: of shuffling, scenes and matchers.
+        episodes: episodes per scene; on a dataset, the first so many (None = all).
+        perception: eyes of the robots in scenes.
+    """
+
+    pose: PoseKnowledge = "unknown"
+    preset: str | None = None
+    min_common: int = 0
+    sequence: bool = False
+    seed: int = 0
+    episodes: int | None = None
+    perception: Perception = "simulated"
+
+    def __post_init__(self) -> None:
+        if self.pose not in get_args(PoseKnowledge):
+            raise ValueError(f"pose must be one of {', '.join(get_args(PoseKnowledge))}, got {self.pose!r}")
+        if self.perception not in get_args(Perception):
+            raise ValueError(f"perception must be one of {', '.join(get_args(Perception))}, got {self.perception!r}")
+        if self.min_common < 0:
+            raise ValueError(f"min_common must be non-negative, got {self.min_common}")
+        if self.seed < 0:
+            raise ValueError(f"seed must be non-negative, got {self.seed}")
+        if self.episodes is not None and self.episodes < 1:
+            raise ValueError(f"episodes must be at least 1, got {self.episodes}")
