@@ -73,7 +73,7 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """All views of one instant. `episode`, the unit of statistics, is the frame's own number where a dataset has none."""
+    """All views of one instant. `episode`, the unit of statistics, is the frame's number where a dataset has none."""
 
     index: int
     episode: int

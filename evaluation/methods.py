@@ -49,7 +49,7 @@ def oracle(source_identity: NDArray[np.int64], target_identity: NDArray[np.int64
 
 
 def random_matching(n: int, m: int, rng: np.random.Generator) -> Matching:
-    """As many matches as fit between n and m detections, drawn uniformly; each is right by chance 1/max(n, m) at most."""
+    """As many matches as fit between n and m detections, drawn uniformly; each is right with chance 1/max(n, m)."""
     k = min(n, m)
     if k == 0:
         return Matching.empty()

@@ -1,0 +1,132 @@
+"""What a robot asserts in its action: boxes, matches, positions; and how it travels in the action's flat leaves.
+
+Slots: a robot has K slots (`max_detections`), one detection each. Leaves that concern partners are partner-major:
+element p * K + k is slot k towards the p-th partner, partners in ascending order, self omitted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+POSITION_BOUND_M = 1000.0
+VARIANCE_BOUND_M2 = 1e6
+
+
+@dataclass(frozen=True, eq=False)
+class Claims:
+    """One robot's claims about one instant.
+
+    Attributes:
+        boxes: (K, 4) [u0, v0, u1, v1] of the visible pixels; a box without area is an empty slot.
+        positions: (K, 3) m fused estimate, this robot's camera frame.
+        positions_single: (K, 3) m this robot's estimate alone.
+        position_variance: (K,) m^2 of the fused estimate, mean over axes.
+        matches: (N-1, K) partner's slot of the same step; K = none.
+        match_scores: (N-1, K) in [0, 1].
+    """
+
+    boxes: NDArray[np.float64]
+    positions: NDArray[np.float64]
+    positions_single: NDArray[np.float64]
+    position_variance: NDArray[np.float64]
+    matches: NDArray[np.int64]
+    match_scores: NDArray[np.float64]
+
+    @classmethod
+    def empty(cls, max_detections: int, n_partners: int) -> Claims:
+        K = max_detections
+        return cls(
+            np.zeros((K, 4)),
+            np.zeros((K, 3)),
+            np.zeros((K, 3)),
+            np.zeros(K),
+            np.full((n_partners, K), K, dtype=np.int64),
+            np.zeros((n_partners, K)),
+        )
+
+    def filled(self) -> NDArray[np.bool_]:
+        """(K,) slots whose box has area."""
+        return (self.boxes[:, 2] > self.boxes[:, 0]) & (self.boxes[:, 3] > self.boxes[:, 1])
+
+
+def claims_to_action(claims: Claims, control: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    """The action that makes these claims, inside the action space: positions and variances are clipped to its bounds."""
+    bound = POSITION_BOUND_M
+    return {
+        "control": np.asarray(control, dtype=np.float32),
+        "boxes": claims.boxes.astype(np.float32).ravel(),
+        "positions": np.clip(claims.positions, -bound, bound).astype(np.float32).ravel(),
+        "positions_single": np.clip(claims.positions_single, -bound, bound).astype(np.float32).ravel(),
+        "position_variance": np.clip(claims.position_variance, 0, VARIANCE_BOUND_M2).astype(np.float32),
+        "matches": claims.matches.astype(np.int64).ravel(),
+        "match_scores": claims.match_scores.astype(np.float32).ravel(),
+    }
+
+
+def action_space(control_size: int, max_detections: int, n_partners: int, width: int, height: int) -> spaces.Dict:
+    """The action space of one robot; every leaf is one-dimensional, because trainers demand it."""
+    K = max_detections
+    bound = POSITION_BOUND_M
+    corner = np.tile(np.array([width, height, width, height], dtype=np.float32), K)
+    return spaces.Dict(
+        {
+            "control": spaces.Box(-1.0, 1.0, (control_size,), np.float32),
+            "boxes": spaces.Box(np.zeros_like(corner), corner, dtype=np.float32),
+            "positions": spaces.Box(-bound, bound, (3 * K,), np.float32),
+            "positions_single": spaces.Box(-bound, bound, (3 * K,), np.float32),
+            "position_variance": spaces.Box(0.0, VARIANCE_BOUND_M2, (K,), np.float32),
+            "matches": spaces.MultiDiscrete(np.full(K * n_partners, K + 1, dtype=np.int64)),
+            "match_scores": spaces.Box(0.0, 1.0, (K * n_partners,), np.float32),
+        }
+    )
+
+
+def decode(agent: str, action: Any, space: spaces.Dict) -> tuple[NDArray[np.float64], Claims]:
+    """Control (d,) and claims of an action.
+
+    Raises:
+        ValueError: a missing or unknown leaf, a wrong shape or type, a NaN, a value outside the space; the message names
+            agent and leaf.
+    """
+    if not isinstance(action, Mapping):
+        raise ValueError(f"{agent}: the action must be a dict of leaves, got {type(action).__name__}")
+    unknown = sorted(set(action) - set(space.spaces))
+    if unknown:
+        raise ValueError(f"{agent}: the action has no leaf {unknown[0]!r}; it has {', '.join(space.spaces)}")
+    leaf = {name: _leaf(agent, name, action, leaf_space) for name, leaf_space in space.spaces.items()}
+    K = len(leaf["position_variance"])
+    return leaf["control"], Claims(
+        leaf["boxes"].reshape(K, 4),
+        leaf["positions"].reshape(K, 3),
+        leaf["positions_single"].reshape(K, 3),
+        leaf["position_variance"],
+        leaf["matches"].reshape(-1, K),
+        leaf["match_scores"].reshape(-1, K),
+    )
+
+
+def _leaf(agent: str, name: str, action: Mapping[str, Any], space: spaces.Space) -> NDArray[Any]:
+    if name not in action:
+        raise ValueError(f"{agent}: leaf {name!r} is missing")
+    value = np.asarray(action[name])
+    discrete = isinstance(space, spaces.MultiDiscrete)
+    kinds = "iu" if discrete else "fiu"
+    if value.dtype.kind not in kinds:
+        raise ValueError(f"{agent}: leaf {name!r} must hold {'integers' if discrete else 'numbers'}, got {value.dtype}")
+    if value.shape != space.shape:
+        raise ValueError(f"{agent}: leaf {name!r} must have shape {space.shape}, got {value.shape}")
+    if value.size == 0:
+        return value.astype(np.int64 if discrete else np.float64)
+    low, high = (0, space.nvec[0] - 1) if discrete else (space.low, space.high)  # type: ignore[attr-defined]
+    if (value >= low).all() and (value <= high).all():
+        return value.astype(np.int64 if discrete else np.float64)
+    if not discrete and np.isnan(value).any():
+        raise ValueError(f"{agent}: leaf {name!r} holds NaN at {int(np.argmax(np.isnan(value)))}")
+    bad = int(np.argmin((value >= low) & (value <= high)))
+    raise ValueError(f"{agent}: leaf {name!r} holds {value[bad]} at {bad}, outside the action space")
