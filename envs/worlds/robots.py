@@ -1,0 +1,510 @@
+"""What the robot scenes share: parameters, the state of an episode, stepping and describing it.
+
+A scene is what stays the same over an episode (`Scene`), its state what changes (`State`); both are frozen and hold all
+there is, so saving is handing them out and restoring is taking them back.
+
+Objects are ordered observers, team, then (where obstacles count as objects) obstacles; so are their identities.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .bullet import BodyState, BoxDynamics, Dynamics
+from .layout import check_layouts, in_disc, observers_around, place_apart, team_layout
+from .lighting import check_times, sample_light
+from .models import ROBOT_CLASSES, Model, models
+from .team import TeamRoutes, advance_waypoints, draw_routes, team_commands
+from .world import Array, Light, SceneGenerationError, Snapshot
+
+Range = tuple[float, float]
+
+SCENE_TRIES = 20
+MAX_OBSERVERS = 8
+FLEET_COLORS = ((240, 196, 32), (226, 120, 40), (196, 60, 48), (84, 140, 76), (64, 112, 176), (208, 208, 204))
+UNIQUE_COLORS = ((230, 60, 160), (40, 200, 210), (150, 80, 210), (120, 220, 60), (250, 250, 250))
+CRATE_COLORS = ((190, 150, 100), (128, 132, 140), (110, 140, 120), (170, 90, 70))
+UNIQUE_MODELS = ("rover", "carrier", "husky")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotSceneParams:
+    """What the generator of a robot scene draws from. Pairs are (low, high) of a uniform draw per episode or per item.
+
+    Attributes:
+        n_team: robots besides the observers; they move by script.
+        n_obstacles: things that stand around and hide others.
+        obstacles: "scenery" (not objects: nobody detects them), "crate" (identical objects) or "husky" (objects that
+            look like the robots).
+        n_backdrop: trees and sheds beyond the arena.
+        scale: size of robots and obstacles relative to a Husky of 0.97 m.
+        team_radius_m: the team starts and stays within this distance of the origin.
+        layouts: how the team stands at first; one is drawn.
+        separation_m: least distance between the centres of two robots or obstacles.
+        moving_share: share of the team that moves at all.
+        team_speed_mps: cruising speed of those.
+        unique_share: share of the team with a class or colour of its own; the others look identical.
+        observer_distance_m: from the team's origin.
+        observer_angle_deg: between the bearings of an observer and the one placed next to it.
+        observer_gaze_m: how far from the origin an observer may aim.
+        camera_height_m: above ground.
+        camera_tilt_deg: downwards.
+        horizontal_fov_deg: of every camera.
+        max_speed_mps, max_turn_radps: of an observer at full control.
+        times_of_day: names of `lighting.TIMES_OF_DAY`; one is drawn.
+        dynamics: "box" (a unicycle with a box body) or "wheels" (pybullet's Husky on four wheel motors).
+        step_seconds: simulated time per step.
+    """
+
+    n_team: int = 15
+    n_obstacles: tuple[int, int] = (3, 6)
+    obstacles: str = "scenery"
+    n_backdrop: tuple[int, int] = (6, 12)
+    scale: float = 1.0
+    team_radius_m: Range = (6.5, 8.5)
+    layouts: tuple[str, ...] = ("scatter", "clusters", "rows", "ring")
+    separation_m: float = 1.5
+    moving_share: float = 0.7
+    team_speed_mps: Range = (0.3, 1.0)
+    unique_share: float = 0.0
+    observer_distance_m: Range = (8.5, 12.0)
+    observer_angle_deg: Range = (35.0, 100.0)
+    observer_gaze_m: float = 3.0
+    camera_height_m: Range = (0.8, 1.2)
+    camera_tilt_deg: Range = (3.0, 9.0)
+    horizontal_fov_deg: float = 75.0
+    max_speed_mps: float = 1.5
+    max_turn_radps: float = 1.2
+    times_of_day: tuple[str, ...] = ("morning", "noon", "afternoon", "evening", "overcast")
+    dynamics: str = "box"
+    step_seconds: float = 0.2
+
+    def __post_init__(self) -> None:
+        """Raise ValueError naming the first impossible value."""
+        for name in ("n_team",):
+            _require(getattr(self, name) >= 0, name, getattr(self, name), "at least 0")
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, tuple) and len(value) == 2 and not isinstance(value[0], str):
+                _require(all(map(math.isfinite, value)), field.name, value, "finite")
+                _require(value[0] <= value[1], field.name, value, "a pair (low, high) with low <= high")
+                if not field.name.endswith("_deg"):
+                    _require(value[0] >= 0, field.name, value, "a pair of non-negative numbers")
+            if isinstance(value, float):
+                _require(math.isfinite(value), field.name, value, "finite")
+        for name in ("scale", "separation_m", "max_speed_mps", "max_turn_radps", "step_seconds"):
+            _require(getattr(self, name) > 0, name, getattr(self, name), "positive")
+        for name in ("moving_share", "unique_share"):
+            _require(0 <= getattr(self, name) <= 1, name, getattr(self, name), "in [0, 1]")
+        _require(self.team_radius_m[0] > 0, "team_radius_m", self.team_radius_m, "positive")
+        _require(self.camera_height_m[0] > 0, "camera_height_m", self.camera_height_m, "positive")
+        _require(self.observer_gaze_m >= 0, "observer_gaze_m", self.observer_gaze_m, "at least 0")
+        _require(1 <= self.horizontal_fov_deg < 179, "horizontal_fov_deg", self.horizontal_fov_deg, "in [1, 179)")
+        _require(self.camera_tilt_deg[0] >= -90, "camera_tilt_deg", self.camera_tilt_deg, "in [-90, 90]")
+        _require(self.camera_tilt_deg[1] <= 90, "camera_tilt_deg", self.camera_tilt_deg, "in [-90, 90]")
+        _require(
+            self.obstacles in ("scenery", "crate", "husky"), "obstacles", self.obstacles, "scenery, crate or husky"
+        )
+        _require(self.dynamics in ("box", "wheels"), "dynamics", self.dynamics, '"box" or "wheels"')
+        check_layouts(self.layouts)
+        check_times(self.times_of_day)
+        footprint = math.pi * (0.5 * self.separation_m) ** 2
+        room = math.pi * (self.team_radius_m[1] + 0.5 * self.separation_m) ** 2
+        _require(
+            0.5 * room >= self.n_team * footprint,
+            "n_team",
+            self.n_team,
+            "few enough for team_radius_m and separation_m",
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What stays the same over an episode: r robots (N observers first), s bodies that stand still.
+
+    Attributes:
+        robot_model: (r,) index into the world's models.
+        obstacles: (k, 3) planar poses.
+        static_poses: (s, 4, 4) T_world_body; the obstacles first.
+        static_model: (s,) index into the world's models.
+        static_objects: how many of the static bodies, from the first, are objects.
+        tints: (r + s, 3).
+        T_robot_camera: (N, 4, 4).
+        light: sun and sky.
+        routes: the team's.
+    """
+
+    robot_model: NDArray[np.int64]
+    obstacles: Array
+    static_poses: Array
+    static_model: NDArray[np.int64]
+    static_objects: int
+    tints: Array
+    T_robot_camera: Array
+    light: Light
+    routes: TeamRoutes
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """What changes: time, robots on the ground, waypoints (t,), what collided (N,), flying observers.
+
+    Attributes:
+        flight: (f, 8) of each flying observer: x, y, z m, heading rad, their rates in the world frame.
+    """
+
+    time: float
+    bodies: BodyState
+    target: NDArray[np.int64]
+    collided: NDArray[np.bool_]
+    flight: Array
+
+
+@dataclass(frozen=True, eq=False)
+class SavedState:
+    """All there is of a world's present; picklable. `key` tells which worlds may take it."""
+
+    key: tuple[Any, ...]
+    scene: Scene
+    state: State
+
+
+class RobotWorld:
+    """The common part of the robot scenes; see `covis.envs.worlds.world.World` for the protocol.
+
+    Columns of `robot_state`: m/s forward, rad/s to the left.
+    """
+
+    classes = ROBOT_CLASSES
+    control_size = 2
+    state_size = 2
+    ends_on_collision = False
+    n_flyers = 0
+    """Observers that fly: the first ones."""
+
+    def __init__(self, n_observers: int, params: RobotSceneParams) -> None:
+        """Raises ValueError for a number of observers that does not fit."""
+        self.params = params
+        self.n_robots = _checked_observers(n_observers, params)
+        self.models: tuple[Model, ...] = models(params.scale)
+        self.meshes = tuple(model.mesh for model in self.models)
+        self.step_seconds = params.step_seconds
+        self.horizontal_fov_rad = np.full(self.n_robots, math.radians(params.horizontal_fov_deg))
+        self._n_objects = self.n_robots + params.n_team
+        self.max_objects = self._n_objects + (params.n_obstacles[1] if params.obstacles != "scenery" else 0)
+        self._dynamics = self._make_dynamics()
+        self._scene: Scene | None = None
+        self._state: State | None = None
+
+    # ------------------------------------------------------------------ the protocol
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Generate a new scene from `rng` alone. Raises SceneGenerationError when none was found in bounded tries."""
+        for attempt in range(SCENE_TRIES):
+            try:
+                scene, planar, flight = self._generate(rng)
+                break
+            except SceneGenerationError as error:
+                if attempt == SCENE_TRIES - 1:
+                    raise SceneGenerationError(
+                        f"no scene in {SCENE_TRIES} tries; the last failed with: {error}"
+                    ) from error
+        state = State(
+            time=0.0,
+            bodies=self._dynamics.rest(planar),
+            target=np.zeros(len(scene.routes.speed), dtype=np.int64),
+            collided=np.zeros(self.n_robots, dtype=bool),
+            flight=flight,
+        )
+        self._take(scene, state)
+
+    def step(self, controls: Array) -> None:
+        """Advance by `step_seconds` under controls (N, d) in [-1, 1]: shares of greatest forward speed and turn rate.
+
+        Raises:
+            ValueError: wrong shape, a value that is not finite or outside [-1, 1].
+        """
+        scene, state = self._present()
+        controls = check_controls(controls, self.n_robots, self.control_size)
+        f = self.n_flyers
+        limits = np.array([self.params.max_speed_mps, self.params.max_turn_radps])
+        target, scripted = self._team_commands(scene, state)
+        bodies, touched = self._dynamics.advance(state.bodies, np.vstack([controls[f:, :2] * limits, scripted]))
+        collided = np.zeros(self.n_robots, dtype=bool)
+        collided[f:] = touched[: self.n_robots - f]
+        flight = self._fly(state.flight, controls[:f])
+        self._state = State(state.time + self.step_seconds, bodies, target, collided, flight)
+
+    def snapshot(self) -> Snapshot:
+        """The present instant."""
+        scene, state = self._present()
+        n, r, f = self.n_robots, len(scene.robot_model), self.n_flyers
+        m = r + scene.static_objects
+        body_model = np.concatenate([scene.robot_model, scene.static_model])
+        body_poses = np.concatenate([self._robot_poses(state), scene.static_poses])
+        centres = self._centres[body_model[:m]]
+        velocities = np.zeros((m, 3))
+        velocities[f:r, :2] = state.bodies.velocity[:, :2]
+        velocities[:f] = state.flight[:, 4:7]
+        poses = body_poses[:m]
+        body_object = np.full(len(body_model), -1, dtype=np.int64)
+        body_object[:m] = np.arange(m)
+        return Snapshot(
+            time=state.time,
+            identity=np.arange(m, dtype=np.int64),
+            object_class=self._object_classes[body_model[:m]],
+            positions=(poses[:, :3, :3] @ centres[..., None])[..., 0] + poses[:, :3, 3],
+            velocities=velocities,
+            headings=np.arctan2(poses[:, 1, 0], poses[:, 0, 0]),
+            sizes=self._sizes[body_model[:m]],
+            body_mesh=body_model,
+            body_poses=body_poses,
+            body_tints=scene.tints.copy(),
+            body_object=body_object,
+            T_world_camera=self._camera_poses(scene, state, body_poses[:n]),
+            robot_object=np.arange(n, dtype=np.int64),
+            robot_velocity=velocities[:n].copy(),
+            robot_state=self._robot_state(state),
+            collided=state.collided.copy(),
+            light=scene.light,
+        )
+
+    def close(self) -> None:
+        """Release the simulator; calling it twice is harmless."""
+        self._dynamics.close()
+
+    # ------------------------------------------------------------------ beyond the protocol
+
+    def save_state(self) -> SavedState:
+        """The whole present: a world of the same kind and parameters that takes it continues bit-identically."""
+        scene, state = self._present()
+        return SavedState(self._key(), scene, state)
+
+    def restore_state(self, saved: SavedState) -> None:
+        """Continue from `saved`. Raises ValueError when it comes from a world of another kind, size or parameters."""
+        if not isinstance(saved, SavedState) or saved.key != self._key():
+            of = saved.key if isinstance(saved, SavedState) else type(saved).__name__
+            raise ValueError(f"this state is not one of {self._key()}, but of {of}")
+        self._take(saved.scene, saved.state)
+
+    # ------------------------------------------------------------------ generation
+
+    def _generate(self, rng: np.random.Generator) -> tuple[Scene, Array, Array]:
+        """A scene, planar poses (r - f, 3) of the robots on the ground and (f, 8) of those in the air."""
+        p = self.params
+        radius = rng.uniform(*p.team_radius_m)
+        team = self._place_team(rng, radius)
+        grounded = self._place_observers(rng, team)
+        flight = self._place_flyers(rng)
+        planar = np.vstack([grounded, team])
+        obstacles = self._place_obstacles(rng, radius, planar)
+        backdrop_poses, backdrop_model, backdrop_tints = self._backdrop(rng)
+        routes = draw_routes(
+            rng, team[:, :2], radius, p.moving_share, p.team_speed_mps, p.max_turn_radps, 1.3 * p.separation_m
+        )
+        model, tints = self._looks(rng)
+        obstacle_model = self._index(self._obstacle_model(rng))
+        fleet = tints[-1] if p.n_team else np.array(FLEET_COLORS[0]) / 255.0
+        color = fleet if p.obstacles == "husky" else np.array(CRATE_COLORS[int(rng.integers(len(CRATE_COLORS)))]) / 255
+        k = len(obstacles)
+        scene = Scene(
+            robot_model=model,
+            obstacles=obstacles,
+            static_poses=np.concatenate([planar_poses(obstacles), backdrop_poses]),
+            static_model=np.concatenate([np.full(k, obstacle_model, dtype=np.int64), backdrop_model]),
+            static_objects=0 if p.obstacles == "scenery" else k,
+            tints=np.vstack([tints, np.tile(color, (k, 1)), backdrop_tints]),
+            T_robot_camera=self._mounts(rng),
+            light=sample_light(rng, p.times_of_day),
+            routes=routes,
+        )
+        return scene, planar, flight
+
+    def _place_team(self, rng: np.random.Generator, radius: float) -> Array:
+        p = self.params
+        layout = p.layouts[int(rng.integers(len(p.layouts)))]
+        proposal = team_layout(rng, layout, radius, p.n_team)
+        spots = place_apart(proposal, p.n_team, p.separation_m, "robot")
+        spots = spots[rng.permutation(p.n_team)]
+        return np.column_stack([spots, rng.uniform(-np.pi, np.pi, p.n_team)])
+
+    def _place_observers(self, rng: np.random.Generator, team: Array) -> Array:
+        p = self.params
+        low, high = p.observer_angle_deg
+        return observers_around(
+            rng,
+            self.n_robots - self.n_flyers,
+            p.observer_distance_m,
+            (math.radians(low), math.radians(high)),
+            p.observer_gaze_m,
+            p.separation_m,
+            team[:, :2],
+        )
+
+    def _place_flyers(self, rng: np.random.Generator) -> Array:
+        return np.zeros((0, 8))
+
+    def _place_obstacles(self, rng: np.random.Generator, radius: float, robots: Array) -> Array:
+        p = self.params
+        k = int(rng.integers(p.n_obstacles[0], p.n_obstacles[1] + 1))
+        name = "husky" if p.obstacles == "husky" else "crate" if p.obstacles == "crate" else "container"
+        half = 0.5 * float(np.hypot(*self.models[self._index(name)].size[:2]))
+        clearance = max(p.separation_m, half + 0.6 * p.scale)
+        spots = place_apart(
+            lambda i: in_disc(rng, radius), k, p.separation_m, "obstacle", taken=robots[:, :2], clearance_m=clearance
+        )
+        return np.column_stack([spots, rng.uniform(-np.pi, np.pi, k)])
+
+    def _backdrop(self, rng: np.random.Generator) -> tuple[Array, NDArray[np.int64], Array]:
+        """Trees and sheds beyond the arena: poses, models, tints."""
+        p = self.params
+        k = int(rng.integers(p.n_backdrop[0], p.n_backdrop[1] + 1))
+        angle = rng.uniform(-np.pi, np.pi, k)
+        edge = max(p.team_radius_m[1], p.observer_distance_m[1]) + 8.0
+        distance = edge + rng.uniform(0.0, 25.0, k)
+        heading = rng.uniform(-np.pi, np.pi, k)
+        names = np.where(rng.uniform(size=k) < 0.7, self._index("tree"), self._index("shed"))
+        tints = np.where(names[:, None] == self._index("tree"), 1.0, rng.uniform(0.55, 0.95, (k, 3)))
+        planar = np.column_stack([distance * np.cos(angle), distance * np.sin(angle), heading])
+        return planar_poses(planar), names.astype(np.int64), tints
+
+    def _looks(self, rng: np.random.Generator) -> tuple[NDArray[np.int64], Array]:
+        """Model (r,) and tint (r, 3) of each robot: one look for all but the unique ones."""
+        p = self.params
+        model = np.full(self._n_objects, self._index("husky"), dtype=np.int64)
+        model[: self.n_flyers] = self._index("drone")
+        fleet = np.array(FLEET_COLORS[int(rng.integers(len(FLEET_COLORS)))], dtype=np.float64)
+        tints = np.tile(np.clip(fleet + rng.uniform(-12, 12, 3), 0, 255) / 255.0, (self._n_objects, 1))
+        unique = round(p.unique_share * p.n_team)
+        for i, color in zip(range(unique), rng.permutation(len(UNIQUE_COLORS)).repeat(unique), strict=False):
+            at = self.n_robots + i
+            model[at] = self._index(UNIQUE_MODELS[int(rng.integers(len(UNIQUE_MODELS)))])
+            tints[at] = np.clip(np.array(UNIQUE_COLORS[int(color)]) + rng.uniform(-12, 12, 3), 0, 255) / 255.0
+        return model, tints
+
+    def _obstacle_model(self, rng: np.random.Generator) -> str:
+        if self.params.obstacles != "scenery":
+            return self.params.obstacles
+        return ("container", "barrier")[int(rng.integers(2))]
+
+    def _mounts(self, rng: np.random.Generator) -> Array:
+        """T_robot_camera (N, 4, 4) of each observer."""
+        p = self.params
+        heights = rng.uniform(*p.camera_height_m, size=self.n_robots)
+        tilts = np.radians(rng.uniform(*p.camera_tilt_deg, size=self.n_robots))
+        return np.stack([camera_mount((0.1 * p.scale, 0.0, h), t) for h, t in zip(heights, tilts, strict=True)])
+
+    # ------------------------------------------------------------------ stepping
+
+    def _team_commands(self, scene: Scene, state: State) -> tuple[NDArray[np.int64], Array]:
+        grounded = self.n_robots - self.n_flyers
+        planar = state.bodies.planar
+        target = advance_waypoints(scene.routes, state.target, planar[grounded:])
+        others = np.vstack([planar[:grounded, :2], scene.obstacles[:, :2]])
+        return target, team_commands(scene.routes, target, planar[grounded:], others)
+
+    def _fly(self, flight: Array, controls: Array) -> Array:
+        return flight
+
+    # ------------------------------------------------------------------ description
+
+    def _robot_poses(self, state: State) -> Array:
+        """T_world_body (r, 4, 4) of observers and team."""
+        return planar_poses(state.bodies.planar)
+
+    def _camera_poses(self, scene: Scene, state: State, robot_poses: Array) -> Array:
+        return robot_poses @ scene.T_robot_camera
+
+    def _robot_state(self, state: State) -> Array:
+        """(N, 2): speed along the heading, turn rate."""
+        n = self.n_robots
+        planar, velocity = state.bodies.planar[:n], state.bodies.velocity[:n]
+        forward = velocity[:, 0] * np.cos(planar[:, 2]) + velocity[:, 1] * np.sin(planar[:, 2])
+        return np.column_stack([forward, velocity[:, 2]])
+
+    # ------------------------------------------------------------------ housekeeping
+
+    def _make_dynamics(self) -> Dynamics:
+        p = self.params
+        grounded = self._n_objects - self.n_flyers
+        self._sizes = np.stack([model.size for model in self.models])
+        self._centres = np.stack([model.centre for model in self.models])
+        self._object_classes = np.array([model.object_class for model in self.models], dtype=np.int64)
+        obstacle = "container" if p.obstacles == "scenery" else p.obstacles
+        robots = np.tile(self._sizes[self._index("husky"), :2], (grounded, 1))
+        obstacles = np.tile(self._sizes[self._index(obstacle), :2], (p.n_obstacles[1], 1))
+        return BoxDynamics(robots, obstacles, step_seconds=p.step_seconds)
+
+    def _index(self, name: str) -> int:
+        return [model.name for model in self.models].index(name)
+
+    def _key(self) -> tuple[Any, ...]:
+        return (type(self).__name__, self.n_robots, self.params)
+
+    def _present(self) -> tuple[Scene, State]:
+        if self._scene is None or self._state is None:
+            raise RuntimeError(f"{type(self).__name__} has no scene yet: call reset(rng) first")
+        return self._scene, self._state
+
+    def _take(self, scene: Scene, state: State) -> None:
+        self._dynamics.set_obstacles(scene.obstacles)
+        self._scene, self._state = scene, state
+
+
+def camera_mount(position: tuple[float, float, float], tilt_rad: float) -> Array:
+    """T_robot_camera (4, 4) of a camera that looks along x of its robot, tilted down by `tilt_rad`."""
+    c, s = math.cos(tilt_rad), math.sin(tilt_rad)
+    T = np.eye(4)
+    T[:3, 0] = (0.0, -1.0, 0.0)  # right
+    T[:3, 1] = (-s, 0.0, -c)  # down
+    T[:3, 2] = (c, 0.0, -s)  # forward
+    T[:3, 3] = position
+    return T
+
+
+def planar_poses(planar: Array) -> Array:
+    """T_world_body (n, 4, 4) of bodies on the ground at planar poses (n, 3)."""
+    out = np.zeros((len(planar), 4, 4))
+    c, s = np.cos(planar[:, 2]), np.sin(planar[:, 2])
+    out[:, 0, 0] = out[:, 1, 1] = c
+    out[:, 1, 0], out[:, 0, 1] = s, -s
+    out[:, :2, 3] = planar[:, :2]
+    out[:, 2, 2] = out[:, 3, 3] = 1.0
+    return out
+
+
+def check_controls(controls: Array, n: int, d: int) -> Array:
+    """The controls as float64 (n, d). Raises ValueError unless of that shape, finite and in [-1, 1]."""
+    checked = np.asarray(controls, dtype=np.float64)
+    if checked.shape != (n, d):
+        raise ValueError(f"controls must have shape {(n, d)}, got {checked.shape}")
+    if not np.isfinite(checked).all():
+        raise ValueError(f"controls must be finite, got {checked.tolist()}")
+    if np.abs(checked).max(initial=0.0) > 1.0:
+        raise ValueError(f"controls must lie in [-1, 1], got {checked.tolist()}")
+    return checked
+
+
+def _checked_observers(n_observers: int, params: RobotSceneParams) -> int:
+    if isinstance(n_observers, bool) or not isinstance(n_observers, int | np.integer):
+        raise ValueError(f"n_observers must be an integer, got {n_observers!r}")
+    if not 2 <= n_observers <= MAX_OBSERVERS:
+        raise ValueError(f"n_observers must be between 2 and {MAX_OBSERVERS}, got {n_observers}")
+    around = 2 * math.pi * params.observer_distance_m[1]
+    if n_observers * params.separation_m > around:
+        raise ValueError(
+            f"n_observers = {n_observers} do not fit on a circle of {params.observer_distance_m[1]} m with "
+            f"separation_m = {params.separation_m}"
+        )
+    return int(n_observers)
+
+
+def _require(ok: bool, name: str, value: object, wanted: str) -> None:
+    if not ok:
+        raise ValueError(f"{name} must be {wanted}, got {value!r}")
