@@ -10,6 +10,7 @@ from .hungarian import hungarian
 from .pose import RelativePose
 from .registry import METHODS, load_matcher
 from .reid import reid
+from .rgm import rgm
 
 __all__ = [
     "METHODS",
@@ -22,4 +23,5 @@ __all__ = [
     "hungarian",
     "load_matcher",
     "reid",
+    "rgm",
 ]

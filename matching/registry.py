@@ -8,10 +8,14 @@ from importlib.metadata import entry_points
 from .graph import Matcher
 from .hungarian import hungarian
 from .reid import reid
+from .rgm import rgm, rgm_no_covisibility, rgm_no_uncertainty
 
 METHODS: dict[str, Matcher] = {
     "hungarian": hungarian,
     "reid": reid,
+    "rgm": rgm,
+    "rgm-no-uncertainty": rgm_no_uncertainty,
+    "rgm-no-covisibility": rgm_no_covisibility,
 }
 
 ENTRY_POINT_GROUP = "covis.matchers"

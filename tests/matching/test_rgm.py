@@ -1,0 +1,220 @@
+"""Algorithm 1: the chain against its enumerated distribution, the result against the brute-force optimum."""
+
+from importlib import import_module
+from itertools import permutations
+
+import numpy as np
+import pytest
+
+from covis.matching import ObjectGraph
+from covis.matching import objective as ob
+from covis.matching.rgm import Annealing, Similarity, rgm
+
+solver = import_module("covis.matching.rgm")  # `covis.matching.rgm` is the function
+
+
+def make_problem(rng, n=4, m=4, common=3, lambda_1=0.1, lambda_2=0.4):
+    p = rng.uniform(-10, 10, (n, 3))
+    q = rng.uniform(-10, 10, (m, 3))
+    q[:common] = p[:common] @ np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]) + rng.normal(0, 0.2, (common, 3))
+    a, b = rng.dirichlet(np.ones(3), n), rng.dirichlet(np.ones(3), m)
+    b[:common] = a[:common]
+    source = ObjectGraph.from_positions(p, attributes=a, position_variance=rng.uniform(0.02, 0.1, n))
+    target = ObjectGraph.from_positions(q, attributes=b, position_variance=rng.uniform(0.02, 0.1, m))
+    k = min(n, m)
+    tables = (ob.coefficients(k, lambda_1, lambda_2, "mean", "squared"), ob.coefficients(k, 0, 0, "mean", "squared"))
+    return solver.build(source, target, Similarity(), *tables)
+
+
+def matchings(n, m):
+    """Every one-to-one partial matching as targets of the sources, -1 = none."""
+    for size in range(min(n, m) + 1):
+        for rows in (r for r in permutations(range(n), size) if list(r) == sorted(r)):
+            for cols in permutations(range(m), size):
+                match = np.full(n, -1)
+                match[list(rows)] = cols
+                yield match
+
+
+def test_pi_is_the_best_assignment_of_the_active_objects():
+    hits = total = 0
+    for seed in range(40):
+        p = make_problem(np.random.default_rng(seed))
+        order = np.argsort(-p.support.ravel(), kind="stable")
+        for mask in range(1, 16):
+            active = np.array([bool(mask >> i & 1) for i in range(4)])
+            state = ob.empty_state(4, 4)
+            solver.assign(p.terms, p.table_pi, state, active, order)
+            assert ((state.match >= 0) == active).all()
+            value = ob.objective(p.terms, state.match, p.table_pi)
+            best = max(ob.objective(p.terms, x, p.table_pi) for x in matchings(4, 4) if ((x >= 0) == active).all())
+            hits += value > best - 1e-9
+            total += 1
+    assert hits / total > 0.85  # greedy and local search on a problem that is NP-hard
+
+
+def test_result_is_the_brute_force_optimum_on_small_problems():
+    hits = 0
+    for seed in range(60):
+        rng = np.random.default_rng(1000 + seed)
+        p = make_problem(rng)
+        match, log_p = solver.solve(p, Annealing(acceptance="metropolis", start_temperature=2.0), rng)
+        assert log_p == pytest.approx(ob.objective(p.terms, match, p.table), abs=1e-9)
+        best = max(ob.objective(p.terms, x, p.table) for x in matchings(4, 4))
+        assert log_p <= best + 1e-9
+        hits += log_p > best - 1e-9
+    assert hits >= 51
+
+
+def test_metropolis_chain_has_the_stationary_distribution_of_eq_16():
+    rng = np.random.default_rng(3)
+    p = make_problem(rng, n=4, m=3)  # all four active cannot be matched: that set has probability zero
+    order = np.argsort(-p.support.ravel(), kind="stable")
+    temperature = 0.7
+    log_p = np.full(16, -np.inf)
+    for mask in range(16):
+        active = np.array([bool(mask >> i & 1) for i in range(4)])
+        if active.sum() <= 3:
+            state = ob.empty_state(4, 3)
+            solver.assign(p.terms, p.table_pi, state, active, order)
+            log_p[mask] = ob.value(state.sums, state.size[0], p.table) / temperature
+    expected = np.exp(log_p - log_p.max())
+    expected /= expected.sum()
+    steps = 400_000
+    _, _, visited = solver.run_chain(
+        p.terms,
+        p.table,
+        p.table_pi,
+        order,
+        np.array([1.0, 0.6, 0.3, 0.15]),
+        np.zeros(4, dtype=bool),
+        np.full(steps, temperature),
+        True,
+        0.4,
+        rng.random((steps, 3)),
+    )
+    share = np.bincount(visited, minlength=16) / steps
+    assert np.abs(share - expected).sum() / 2 < 0.01  # total variation
+    assert share[15] == 0
+
+
+def test_paper_acceptance_only_climbs():
+    rng = np.random.default_rng(4)
+    p = make_problem(rng, n=5, m=5)
+    order = np.argsort(-p.support.ravel(), kind="stable")
+    active = solver.initial_active(p.support)
+    steps = 300
+    _, best, visited = solver.run_chain(
+        p.terms, p.table, p.table_pi, order, p.proposal_weight, active, np.ones(steps), False, 0.5,
+        rng.random((steps, 3)),
+    )  # fmt: skip
+    values = []
+    for mask in visited:
+        state = ob.empty_state(5, 5)
+        solver.assign(p.terms, p.table_pi, state, np.array([bool(mask >> i & 1) for i in range(5)]), order)
+        values.append(ob.value(state.sums, state.size[0], p.table))
+    assert (np.diff(values) >= -1e-12).all()
+    assert best == pytest.approx(max(values))
+
+
+def scene(rng, common=8, extra=4, noise=0.05):
+    p = rng.uniform(-20, 20, (common + extra, 3)) * [1, 1, 0.1]
+    q = p @ np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]) + [3, 1, 0] + rng.normal(0, noise, p.shape)
+    q[common:] = rng.uniform(-20, 20, (extra, 3)) * [1, 1, 0.1]
+    shuffle = rng.permutation(len(q))
+    options = {"position_variance": noise**2, "up": [0, 0, 1]}
+    truth = {i: int(np.flatnonzero(shuffle == i)[0]) for i in range(common)}
+    return ObjectGraph.from_positions(p, **options), ObjectGraph.from_positions(q[shuffle], **options), truth
+
+
+@pytest.mark.parametrize("acceptance", ["paper", "metropolis"])
+def test_finds_covisible_objects_among_identical_ones(acceptance):
+    correct = retrieved = common = 0
+    for seed in range(10):
+        source, target, truth = scene(np.random.default_rng(seed))
+        found = rgm(source, target, acceptance=acceptance)
+        correct += sum(truth.get(int(a)) == b for a, b in found.pairs)
+        retrieved += len(found)
+        common += len(truth)
+    assert correct / retrieved > 0.9
+    assert correct / common > 0.7
+
+
+def test_same_stream_same_answer():
+    source, target, _ = scene(np.random.default_rng(0))
+    a = rgm(source, target, rng=np.random.default_rng(5))
+    b = rgm(source, target, rng=np.random.default_rng(5))
+    assert (a.pairs == b.pairs).all()
+    assert (a.scores == b.scores).all()
+
+
+def test_workers_share_the_proposals():
+    source, target, truth = scene(np.random.default_rng(1))
+    one = rgm(source, target, proposals=200)
+    two = rgm(source, target, proposals=200, workers=2)
+    assert two.diagnostics["log_p"] >= 0.8 * one.diagnostics["log_p"] > 0
+    assert sum(truth.get(int(a)) == b for a, b in two.pairs) > len(two) / 2
+
+
+def test_reject_mirrored_tells_a_scene_from_its_reflection():
+    rng = np.random.default_rng(2)
+    p = rng.uniform(-10, 10, (8, 3))
+    p[:, 2] = 0
+    source = ObjectGraph.from_positions(p, up=[0, 0, 1])
+    mirrored = ObjectGraph.from_positions(p * [1, -1, 1], up=[0, 0, 1])
+    blind = rgm(source, mirrored)
+    seeing = rgm(source, mirrored, reject_mirrored=True)
+    assert len(blind) == 8
+    assert seeing.diagnostics["log_p"] < 0.8 * blind.diagnostics["log_p"]
+
+
+def test_noncovisibility_weight_reduces_the_number_of_matches():
+    source, target, _ = scene(np.random.default_rng(3), common=6, extra=6)
+    counts = [len(rgm(source, target, noncovisibility_weight=w)) for w in (0.0, 0.4, 0.9, 2.0)]
+    assert counts[0] == 12
+    assert counts == sorted(counts, reverse=True)
+    assert counts[-1] == 0
+
+
+def test_uncertainty_weight_drops_uncertain_objects_first():
+    source, target, _ = scene(np.random.default_rng(4), common=8, extra=0)
+    u = source.position_variance.copy()
+    u[:2] *= 60
+    source = ObjectGraph.from_positions(source.positions, position_variance=u)
+    kept = {int(a) for a in rgm(source, target, uncertainty_weight=0.1).pairs[:, 0]}
+    assert kept
+    assert not kept & {0, 1}
+
+
+def test_objects_of_unknown_variance_are_not_matched():
+    source, target, _ = scene(np.random.default_rng(5))
+    u = source.position_variance.copy()
+    u[3] = np.inf
+    found = rgm(ObjectGraph.from_positions(source.positions, position_variance=u), target)
+    assert len(found) > 0
+    assert 3 not in found.pairs[:, 0]
+
+
+def test_too_many_objects_are_refused_with_the_limit():
+    big = ObjectGraph.from_positions(np.zeros((65, 3)))
+    with pytest.raises(ValueError, match="rgm accepts at most 64 objects a side, target has 65"):
+        rgm(ObjectGraph.from_positions(np.zeros((2, 3))), big)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"acceptance": "greedy"}, "acceptance must be one of"),
+        ({"proposals": -1}, "proposals must not be negative, got -1"),
+        ({"end_temperature": 0.0}, "end_temperature"),
+        ({"add_probability": 1.0}, "add_probability must lie in"),
+        ({"proposal_width": 0.0}, "proposal_width must be positive"),
+        ({"distance_width_m2": -1.0}, "distance_width_m2 must be positive, got -1"),
+        ({"neighbours": 0}, "neighbours must be at least 1"),
+        ({"workers": 0}, "workers must be at least 1"),
+    ],
+)
+def test_bad_options_name_the_value(options, message):
+    g = ObjectGraph.from_positions(np.eye(3))
+    with pytest.raises(ValueError, match=message):
+        rgm(g, g, **options)
