@@ -56,7 +56,7 @@ class Claims:
 
 
 def claims_to_action(claims: Claims, control: NDArray[Any]) -> dict[str, NDArray[Any]]:
-    """The action that makes these claims, inside the action space: positions and variances are clipped to its bounds."""
+    """The action that makes these claims; positions and variances are clipped to the action space's bounds."""
     bound = POSITION_BOUND_M
     return {
         "control": np.asarray(control, dtype=np.float32),
@@ -91,8 +91,8 @@ def decode(agent: str, action: Any, space: spaces.Dict) -> tuple[NDArray[np.floa
     """Control (d,) and claims of an action.
 
     Raises:
-        ValueError: a missing or unknown leaf, a wrong shape or type, a NaN, a value outside the space; the message names
-            agent and leaf.
+        ValueError: a missing or unknown leaf, a wrong shape or type, a NaN, a value outside the space; the message
+            names agent and leaf.
     """
     if not isinstance(action, Mapping):
         raise ValueError(f"{agent}: the action must be a dict of leaves, got {type(action).__name__}")

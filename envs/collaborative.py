@@ -14,8 +14,8 @@ from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
-from .camera.raster import Rasterizer, intrinsics_from_fov
 from .camera.raster import Frame as CameraFrame
+from .camera.raster import Rasterizer, intrinsics_from_fov
 from .claims import Claims, action_space, decode
 from .scoring import LocalizationReward, Reward, StepScore, Truth, score, tight_boxes
 from .sensing import MAX_DEPTH_M, PoseNoise, permuted_instances, up_in_camera
@@ -124,9 +124,9 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         self._claims: list[Claims] = []
         self._last_score: StepScore | None = None
         space = action_space(self.world.control_size, self.max_detections, n - 1, self.width, self.height)
-        self.action_spaces = {agent: space for agent in self.possible_agents}
+        self.action_spaces = dict.fromkeys(self.possible_agents, space)
         observation = self._make_observation_space()
-        self.observation_spaces = {agent: observation for agent in self.possible_agents}
+        self.observation_spaces = dict.fromkeys(self.possible_agents, observation)
         self.state_space = spaces.Box(-np.inf, np.inf, (self._state_size(),), np.float64)
 
     # Spaces
@@ -234,9 +234,9 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
             self.render()
         return (
             observations,
-            {agent: reward for agent in agents},
-            {agent: crashed for agent in agents},
-            {agent: over and not crashed for agent in agents},
+            dict.fromkeys(agents, reward),
+            dict.fromkeys(agents, crashed),
+            dict.fromkeys(agents, over and not crashed),
             infos,
         )
 
@@ -365,7 +365,7 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
 
         picture = compose(self)
         if self.render_mode == "human":
-            self._window = show(picture, self._window, self.metadata["name"])
+            self._window = show(picture, self._window, self.name)
             return None
         return picture
 
@@ -380,7 +380,7 @@ N_SUMS = 7
 
 
 def _sums(result: StepScore) -> NDArray[np.float64]:
-    """Per robot (N, 7): the team's correct, retrieved, covisible, visible; its own single and fused error (m), number."""
+    """Per robot (N, 7): the team's correct, retrieved, covisible, visible; own single and fused error (m), number."""
     counts = result.counts
     team = (counts.correct, counts.retrieved, counts.common, result.n_visible)
     localized = ~np.isnan(result.error_single)

@@ -184,7 +184,7 @@ def _score_pair(a: int, b: int, claims: Sequence[Claims], tied: NDArray[np.int64
     )
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def tie(boxes: Array, true_boxes: Array, pixels: NDArray[np.int64]) -> NDArray[np.int64]:
     """Object index (K,) of each claimed box (K, 4), -1 = none; true boxes (m, 4), visible pixels (m,)."""
     K, m = len(boxes), len(true_boxes)
@@ -203,7 +203,7 @@ def tie(boxes: Array, true_boxes: Array, pixels: NDArray[np.int64]) -> NDArray[n
                 iou[k, j] = overlap / ((u1 - u0) * (v1 - v0) + (t1 - t0) * (w1 - w0) - overlap)
     out = np.full(K, -1, dtype=np.int64)
     for _ in range(min(K, m)):
-        best = np.argmax(iou)
+        best = int(np.argmax(iou))
         k, j = best // m, best % m
         if iou[k, j] < MIN_IOU:
             break
@@ -213,7 +213,7 @@ def tie(boxes: Array, true_boxes: Array, pixels: NDArray[np.int64]) -> NDArray[n
     return out
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def tight_boxes(instances: NDArray[np.int32], m: int) -> tuple[Array, NDArray[np.int64]]:
     """Tight boxes (m, 4) [u0, v0, u1, v1] and pixel counts (m,) of the objects 0..m-1 in an instance image (H, W)."""
     height, width = instances.shape

@@ -6,23 +6,32 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from .engine import Unit, dataset_units, run, target_name
+from .engine import Unit, dataset_units, run, scene_units, target_name
+from .extras import require
 from .methods import Method
 from .records import summarise
 from .settings import Settings
 
+SCENE_NAMES = ("connected_driving", "multi_robot")
+"""As in `covis.envs.scenes.SCENES`, which needs the simulators; a test compares the two."""
+
 
 def plan(targets: Sequence[str], settings: Settings) -> list[Unit]:
-    """Work units of the targets: dataset folders.
+    """Work units of the targets: names of scenes and dataset folders.
 
     Raises:
         ValueError: a target that is neither.
+        MissingExtraError: a scene without the packages it needs.
     """
     units: list[Unit] = []
     for target in targets:
-        if not Path(target).is_dir():
-            raise ValueError(f"target {target!r} is not a dataset folder")
-        units += dataset_units(target, settings)
+        if target in SCENE_NAMES:
+            require("envs")
+            units += scene_units(target, settings)
+        elif Path(target).is_dir():
+            units += dataset_units(target, settings)
+        else:
+            raise ValueError(f"target {target!r} is neither a dataset folder nor a scene ({', '.join(SCENE_NAMES)})")
     return units
 
 

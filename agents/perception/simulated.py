@@ -212,9 +212,9 @@ def measure(instances: NDArray[np.int32], depth: NDArray[np.float32], n_ids: int
                     out[i, OCCLUSION] += 1  # the image's edge cuts it off
                 elif instances[w, x] != i:
                     outline[i] += 1
-                    if depth[w, x] < depth[v, u] - 0.1 and w <= v:
-                        out[i, OCCLUSION] += 1
-                    elif instances[w, x] != 0 and depth[w, x] < depth[v, u]:
+                    if (depth[w, x] < depth[v, u] - 0.1 and w <= v) or (
+                        instances[w, x] != 0 and depth[w, x] < depth[v, u]
+                    ):
                         out[i, OCCLUSION] += 1
     for i in range(1, n_ids):
         if out[i, PIXELS] > 0:

@@ -1,0 +1,101 @@
+"""The scenes by name: how to build each world, and what its environment assumes by default."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from pettingzoo import AECEnv
+from pettingzoo.utils.conversions import parallel_to_aec
+
+from .collaborative import CollaborativeEnv
+from .scoring import LocalizationReward
+from .sensing import PoseNoise
+from .worlds.driving import ConnectedDrivingWorld
+from .worlds.multi_robot import MultiRobotWorld
+from .worlds.world import World
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A world with the defaults of its environment.
+
+    Attributes:
+        world: called with (n_robots, params).
+    preset: name of a difficulty -> params of the world.
+        n_robots: default number of robots with cameras.
+        pose_noise: errors of the robots' reported poses.
+        reward: the team's default reward.
+        version: of rendering and presets; a change that alters results raises it.
+    """
+
+    world: Callable[..., World]
+    preset: Callable[[str], Any]
+    n_robots: int
+    pose_noise: PoseNoise
+    reward: LocalizationReward
+    version: int = 0
+
+
+def _default_params(preset: str) -> Any:
+    if preset != "paper":
+        raise ValueError(f"no preset is called {preset!r} here; there is paper")
+    return None
+
+
+SCENES: dict[str, Scene] = {
+    "connected_driving": Scene(
+        ConnectedDrivingWorld, _default_params, 2, PoseNoise(1.0, 0.0175), LocalizationReward(cap_m=5.0)
+    ),
+    "multi_robot": Scene(MultiRobotWorld, _default_params, 2, PoseNoise(0.3, 0.02), LocalizationReward(cap_m=2.0)),
+}
+
+
+def parallel_env(
+    scene: str, *, n_robots: int | None = None, preset: str | None = None, params: Any = None, **options: Any
+) -> CollaborativeEnv:
+    """A scene as a PettingZoo ParallelEnv.
+
+    Args:
+        scene: a name in SCENES.
+        n_robots: robots with cameras; None = the scene's default.
+        preset: difficulty, `easy`, `paper` or `hard`; None = `paper`.
+        params: of the world's generator, instead of a preset.
+        options: of `CollaborativeEnv`.
+
+    Raises:
+        ValueError: an unknown scene, or what the world or the environment refuses.
+    """
+    if scene not in SCENES:
+        raise ValueError(f"no scene is called {scene!r}; there are {', '.join(SCENES)}")
+    spec = SCENES[scene]
+    if params is not None and preset is not None:
+        raise ValueError(f"give a preset or params, not both: preset={preset!r}")
+    params = spec.preset(preset or "paper") if params is None else params
+    make_world = partial(spec.world, spec.n_robots if n_robots is None else n_robots, params)
+    defaults: dict[str, Any] = {
+        "name": f"{scene}_v{spec.version}",
+        "pose_noise": spec.pose_noise,
+        "reward": spec.reward,
+    }
+    return CollaborativeEnv(make_world, **(defaults | options))
+
+
+def aec_env(scene: str, **options: Any) -> AECEnv:
+    """The same scene turn by turn: all claims are scored when the last robot has acted."""
+    return parallel_to_aec(parallel_env(scene, **options))
+
+
+def register(scene: str) -> None:
+    """Enter the scene in PettingZoo's registry, where PettingZoo has one."""
+    try:
+        from pettingzoo import parallel_registry
+        from pettingzoo import register as enter
+    except ImportError:
+        return
+    name = f"covis/{scene}-v{SCENES[scene].version}"
+    if name not in parallel_registry:
+        enter("parallel", name, partial(parallel_env, scene))
+        enter("aec", name, partial(aec_env, scene))

@@ -1,0 +1,161 @@
+"""Every method on every pair of robots of a scene's episodes, from pixels to displacement error.
+
+All methods see the same frames: the robots move by the scene's own scripted controllers, which no claim influences, and
+each robot's eyes look once per step. Claims are scored by the environment's own rules.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..agents.controllers import scripted_controls
+from ..agents.localizer import Matchings, View, claims, look, relative_pose
+from ..agents.perception import make_perceptor
+from ..envs.claims import Claims, claims_to_action
+from ..envs.collaborative import CollaborativeEnv
+from ..envs.scenes import parallel_env
+from ..envs.scoring import PairScore, StepScore, score, tie
+from .matching_run import match_pair
+from .methods import Method
+from .records import Record
+from .settings import MIN_DETECTIONS, Settings
+
+
+@dataclass(frozen=True, eq=False)
+class SceneFrame:
+    """One instant of a scene: what the robots brought, and what each method made of it."""
+
+    episode: int
+    step: int
+    views: list[View]
+    matchings: dict[str, Matchings]
+    match_ms: dict[str, dict[tuple[int, int], float]]
+    claims: dict[str, list[Claims]]
+    scores: dict[str, StepScore]
+
+
+def run_episodes(scene: str, episodes: Sequence[int], methods: Sequence[Method], settings: Settings) -> list[Record]:
+    """Records of the given episodes, in order of time, pair and method."""
+    env = make_env(scene, settings)
+    try:
+        return [
+            record
+            for episode in episodes
+            for frame in play(env, episode, methods, settings)
+            for method in methods
+            for record in records(scene, frame, method)
+        ]
+    finally:
+        env.close()
+
+
+def make_env(scene: str, settings: Settings, **options: Any) -> CollaborativeEnv:
+    sensors = ("image",) if settings.perception == "learned" else ("image", "depth", "instances")
+    return parallel_env(scene, preset=settings.preset, sensors=sensors, **options)
+
+
+def play(env: CollaborativeEnv, episode: int, methods: Sequence[Method], settings: Settings) -> Iterator[SceneFrame]:
+    """The frames of one episode; between two of them the environment stands at the instant of the first."""
+    perceive = make_perceptor(settings.perception, env)
+    observations, _ = env.reset(seed=[settings.seed, episode])
+    step = 0
+    while env.agents:
+        stream = (settings.seed, episode, step)
+        eyes = np.random.default_rng(stream).spawn(len(env.agents))
+        views = [
+            look(perceive, observations[agent], env.max_detections, rng)
+            for agent, rng in zip(env.agents, eyes, strict=True)
+        ]
+        frame = _match_frame(env, views, methods, settings, episode, step)
+        yield frame
+        controls = scripted_controls(env.world)
+        said = next(iter(frame.claims.values()))
+        actions = {a: claims_to_action(said[i], controls[i]) for i, a in enumerate(env.agents)}
+        observations, *_ = env.step(actions)
+        step += 1
+
+
+def _match_frame(
+    env: CollaborativeEnv,
+    views: list[View],
+    methods: Sequence[Method],
+    settings: Settings,
+    episode: int,
+    step: int,
+) -> SceneFrame:
+    truth = env.ground_truth()
+    identities = [identity(view, i, env) for i, view in enumerate(views)]
+    frame = SceneFrame(episode, step, views, {}, {}, {}, {})
+    for method in methods:
+        found: Matchings = {}
+        elapsed: dict[tuple[int, int], float] = {}
+        for number, (i, j) in enumerate(combinations(range(len(views)), 2)):
+            if min(len(views[i].detections), len(views[j].detections)) < MIN_DETECTIONS:
+                continue
+            found[i, j], elapsed[i, j] = match_pair(
+                method,
+                views[i].detections.graph,
+                views[j].detections.graph,
+                (identities[i], identities[j]),
+                relative_pose(views[i], views[j]) if settings.pose == "known" else None,
+                (settings.seed, episode, step, number),
+                f"{env.name}, episode {episode}, step {step}, robots {i} and {j}",
+            )
+        said = claims(views, found, env.max_detections)
+        frame.matchings[method.label] = found
+        frame.match_ms[method.label] = elapsed
+        frame.claims[method.label] = said
+        frame.scores[method.label] = score(said, truth)
+    return frame
+
+
+def identity(view: View, robot: int, env: CollaborativeEnv) -> NDArray[np.int64]:
+    """True object (n,) of each detection by the rules of scoring; -1 = none."""
+    truth = env.ground_truth()
+    tied = tie(view.detections.boxes, truth.boxes[robot], truth.pixels[robot])
+    return np.where(tied >= 0, truth.identity[tied], -1) if len(truth.identity) else np.full(len(tied), -1)
+
+
+def records(scene: str, frame: SceneFrame, method: Method) -> Iterator[Record]:
+    """One record per pair of robots that was matched."""
+    result = frame.scores[method.label]
+    given: set[tuple[int, int]] = set()
+    for pair in result.pairs:
+        if (pair.a, pair.b) not in frame.matchings[method.label]:
+            continue
+        single, fused = _errors(pair, result, given)
+        yield Record(
+            target=scene,
+            method=method.label,
+            episode=frame.episode,
+            frame=frame.step,
+            source=f"robot_{pair.a}",
+            partner=f"robot_{pair.b}",
+            correct=pair.counts.correct,
+            retrieved=pair.counts.retrieved,
+            common=pair.counts.common,
+            visible=pair.n_visible,
+            match_ms=frame.match_ms[method.label][pair.a, pair.b],
+            scores=pair.scores.tolist(),
+            hits=pair.hits.tolist(),
+            error_single_m=single,
+            error_fused_m=fused,
+        )
+
+
+def _errors(pair: PairScore, result: StepScore, given: set[tuple[int, int]]) -> tuple[list[float], list[float]]:
+    """Displacement errors of the pair's right matches; a slot that several pairs match counts with the first alone."""
+    single, fused = [], []
+    for slots in pair.assertions[pair.hits].tolist():
+        for key in zip((pair.a, pair.b), slots, strict=True):
+            if key not in given:
+                given.add(key)
+                single.append(float(result.error_single[key]))
+                fused.append(float(result.error_fused[key]))
+    return single, fused
