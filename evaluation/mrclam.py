@@ -2,12 +2,13 @@
 
 Raw files of one sequence: `Barcodes.dat`, `Landmark_Groundtruth.dat` and, for each robot i, `Robot<i>_Measurement.dat`
 (time, barcode, range, bearing), `Robot<i>_Odometry.dat` (time, speed, turn rate) and `Robot<i>_Groundtruth.dat` (time,
-x, y, heading from motion capture). A frame is one window of time; a robot's readings in it are moved to the window's end
-by its odometry, and the readings of one barcode become one detection. The barcode is the identity, which no matcher sees.
+x, y, heading from motion capture). A frame is one window of time; a robot's readings in it are moved to the window's
+end by its odometry, and the readings of one barcode become one detection. The barcode is the identity, which no
+matcher sees.
 
-The odometry is what the robots were told to do, not what they did: on sequence 6 the motion follows 0.2 to 0.25 s later,
-and turns are 0.91 to 0.95 as large. Each robot's odometry is therefore calibrated on how its own readings of landmarks
-move from one moment to the next; no motion capture is used, and short logs are left as they are.
+The odometry is what the robots were told to do, not what they did: on sequence 6 the motion follows 0.2 to 0.25 s
+later, and turns are 0.91 to 0.95 as large. Each robot's odometry is therefore calibrated on how its own readings of
+landmarks move from one moment to the next; no motion capture is used, and short logs are left as they are.
 
 Robot frame: x forward, y left, z up; everything lies in the plane z = 0.
 """
@@ -66,7 +67,7 @@ class RangeBearingNoise:
     range_std_m: float = 0.03
     range_std_per_m: float = 0.035
     bearing_std_rad: float = 0.012
-    turn_rate_std_rad_s: float = 0.01
+    turn_rate_std_rad_s: float = 0.02
     height_std_m: float = 0.01
 
 
@@ -299,7 +300,7 @@ def _prediction_errors(track: Track, before: Array, after: Array) -> Array:
 
 def _states_at(track: Track, times: Array) -> Array:
     """States (n, 3) interpolated at times (n,)."""
-    return np.stack([np.interp(times, track.times, track.states[:, i]) for i in range(3)], axis=1)
+    return np.stack([np.interp(times, track.times, column) for column in track.states.T], axis=1).astype(np.float64)
 
 
 def pose_at(track: Track, time: float) -> Array:
@@ -323,10 +324,10 @@ def _window_ends(robots: list[RobotLog], window: float) -> Array:
     """Times (f,) s at which the frames' windows end: from the last robot's start to the first robot's end."""
     start = max(float(r.dead_reckoning.times[0]) for r in robots)
     stop = min(float(r.dead_reckoning.times[-1]) for r in robots)
-    count = int((stop - start) / window)
+    count = int((stop - start) / window + 1e-6)
     if count < 1:
         raise MrclamError(f"the robots' odometry overlaps by {stop - start:.1f} s, less than one window of {window} s")
-    return start + window * np.arange(1, count + 1)
+    return np.asarray(start + window * np.arange(1, count + 1), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
