@@ -106,7 +106,7 @@ class Snapshot:
 
 
 class World(Protocol):
-    """Simulator state and transition.
+    """Simulator state and transition. The attributes may be plain ones; the protocol only reads them.
 
     Attributes:
         classes: kinds of objects, in the order of the attribute vector.
@@ -120,18 +120,35 @@ class World(Protocol):
         ends_on_collision: whether a collision of any robot ends the episode.
     """
 
-    classes: tuple[ObjectClass, ...]
-    meshes: tuple[Mesh, ...]
-    n_robots: int
-    max_objects: int
-    control_size: int
-    state_size: int
-    horizontal_fov_rad: Array
-    step_seconds: float
-    ends_on_collision: bool
+    @property
+    def classes(self) -> tuple[ObjectClass, ...]: ...
+
+    @property
+    def meshes(self) -> tuple[Mesh, ...]: ...
+
+    @property
+    def n_robots(self) -> int: ...
+
+    @property
+    def max_objects(self) -> int: ...
+
+    @property
+    def control_size(self) -> int: ...
+
+    @property
+    def state_size(self) -> int: ...
+
+    @property
+    def horizontal_fov_rad(self) -> Array: ...
+
+    @property
+    def step_seconds(self) -> float: ...
+
+    @property
+    def ends_on_collision(self) -> bool: ...
 
     def reset(self, rng: np.random.Generator) -> None:
-        """Generate a new scene from `rng` alone. Raises SceneGenerationError when no valid one was found in bounded tries."""
+        """Generate a new scene from `rng` alone. Raises SceneGenerationError if that fails within bounded tries."""
 
     def step(self, controls: Array) -> None:
         """Advance by `step_seconds` under controls (N, d) in [-1, 1]."""
