@@ -5,6 +5,7 @@ from __future__ import annotations
 import typer
 
 from .benchmark import benchmark
+from .demo import demo
 
 app = typer.Typer(
     name="covis",
@@ -13,12 +14,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
+app.command()(demo)
 app.command()(benchmark)
-
-
-@app.callback()
-def _root() -> None:
-    """Keeps subcommands named even where there is only one."""
 
 
 def main() -> None:

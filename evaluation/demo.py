@@ -1,0 +1,76 @@
+"""The main job, small: scenes x methods from pixels to displacement error, with a report."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from .benchmark import SCENE_NAMES, benchmark
+from .engine import write_atomically
+from .extras import require
+from .methods import Method
+from .settings import Settings
+
+METHODS = ("random", "reid", "rgm", "oracle")
+EPISODES = 2
+COLUMNS = (
+    ("method", "method"),
+    ("precision", "precision"),
+    ("recall", "recall"),
+    ("f1", "F1"),
+    ("displacement_single_m", "one robot alone, m"),
+    ("displacement_fused_m", "fused, m"),
+    ("match_ms", "ms a pair"),
+)
+
+
+def demo(
+    out: Path, seed: int = 0, progress: Callable[[int, int], None] = lambda done, total: None
+) -> list[dict[str, Any]]:
+    """Run the demo into a folder: rows.json, report.md and, per scene, pictures of every method's matches.
+
+    Raises:
+        MissingExtraError: without the packages of `covis[envs]`.
+    """
+    require("envs")
+    from .gallery import Picture, correspondence_pictures
+
+    methods = [Method.parse(name) for name in METHODS]
+    settings = Settings(seed=seed, episodes=EPISODES)
+    n_scenes = len(SCENE_NAMES)
+    rows = benchmark(SCENE_NAMES, methods, settings, progress=lambda done, total: progress(done, total + n_scenes))
+    pictures: dict[str, list[Picture]] = {}
+    for i, scene in enumerate(SCENE_NAMES):
+        progress(n_scenes + i, 2 * n_scenes)
+        pictures[scene] = correspondence_pictures(scene, methods, settings, out / "pictures")
+    write_atomically(out / "rows.json", json.dumps({"rows": rows}, indent=1).encode())
+    write_atomically(out / "report.md", _report(rows, pictures, out, seed).encode())
+    return rows
+
+
+def _report(rows: Sequence[dict[str, Any]], pictures: dict[str, list[Any]], out: Path, seed: int) -> str:
+    lines = [
+        "# covis demo",
+        "",
+        f"Seed {seed}, {EPISODES} episodes a scene, simulated perception, poses unknown to the matchers.",
+        "Green lines are right matches, dashed red ones wrong; grey boxes are detections left unmatched.",
+    ]
+    for scene, shown in pictures.items():
+        lines += ["", f"## {scene}", "", "| " + " | ".join(title for _, title in COLUMNS) + " |"]
+        lines += ["|" + " --- |" * len(COLUMNS)]
+        lines += [
+            "| " + " | ".join(_cell(row.get(key)) for key, _ in COLUMNS) + " |"
+            for row in rows
+            if row["target"] == scene
+        ]
+        for picture in shown:
+            lines += ["", f"![{picture.caption}]({picture.file.relative_to(out)})"]
+    return "\n".join(lines) + "\n"
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return ""
+    return value if isinstance(value, str) else f"{value:.3f}"

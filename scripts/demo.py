@@ -1,0 +1,27 @@
+"""`covis demo`: the main job, small."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..evaluation.demo import demo as run_demo
+from .benchmark import table
+from .console import fail, out, progress_bar
+
+
+def demo(
+    folder: Annotated[Path, typer.Option("--out", help="Folder of the report.")] = Path("covis-demo"),
+    seed: Annotated[int, typer.Option(help="Of scenes, eyes and matchers.")] = 0,
+) -> None:
+    """Scenes x methods, from pixels to displacement error: a table here, a report with pictures in a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with progress_bar("demo") as progress:
+            rows = run_demo(folder, seed, progress)
+    except (ValueError, RuntimeError) as error:
+        fail(error)
+    out.print(table(rows))
+    out.print(f"Report with pictures: {folder / 'report.md'}")
