@@ -5,6 +5,7 @@
 Every matcher is a function `(source, target, *, prior=None, rng=None, **options) -> Matching`.
 """
 
+from .bayes import bayes
 from .graph import Hypothesis, Matcher, Matching, ObjectGraph, PriorRequiredError
 from .hungarian import hungarian
 from .pose import RelativePose
@@ -20,6 +21,7 @@ __all__ = [
     "ObjectGraph",
     "PriorRequiredError",
     "RelativePose",
+    "bayes",
     "hungarian",
     "load_matcher",
     "reid",

@@ -5,12 +5,14 @@ from __future__ import annotations
 from importlib import import_module
 from importlib.metadata import entry_points
 
+from .bayes import bayes
 from .graph import Matcher
 from .hungarian import hungarian
 from .reid import reid
 from .rgm import rgm, rgm_no_covisibility, rgm_no_uncertainty
 
 METHODS: dict[str, Matcher] = {
+    "bayes": bayes,
     "hungarian": hungarian,
     "reid": reid,
     "rgm": rgm,
