@@ -4,7 +4,9 @@
 their state into one table, and kernels do what highway-env does vehicle by vehicle (projections onto lanes, neighbours,
 the Intelligent Driver Model, steering, the bicycle model, the closest lane, collisions, predicted conflicts). Rare
 decisions (routes, lane changes, who yields) run highway-env's own code. `stock_twin` copies a road into highway-env's
-own classes; the tests drive both side by side.
+own classes; the tests drive both side by side. Traffic amplifies a difference in the last bit, so wherever such a
+difference would reach a vehicle's motion the transcendental functions are NumPy's, as in highway-env, and not the
+compiler's.
 
 Everything here is in highway-env's frame (x right, y down on its screen).
 """
@@ -39,11 +41,14 @@ L_RADIUS, L_START_PHASE, L_TURN, L_SPEED_LIMIT, LANE_COLUMNS = range(11, 16)
 # Columns of the vehicle table.
 V_X, V_Y, V_HEADING, V_SPEED, V_LANE, V_TARGET, V_TARGET_SPEED, V_DELTA, V_LENGTH, V_WIDTH = range(10)
 V_ACC_MAX, V_COMFORT_MAX, V_COMFORT_MIN, V_DISTANCE, V_TIME, V_CRASHED, V_STEERING, V_ACCELERATION = range(10, 18)
-V_IMPACT_X, V_IMPACT_Y, V_IMPACTED, VEHICLE_COLUMNS = range(18, 22)
+V_IMPACT_X, V_IMPACT_Y, V_IMPACTED, V_COS, V_SIN, VEHICLE_COLUMNS = range(18, 24)
+# Columns of the situation table: what an IDM driver needs to know.
+S_WANTED, S_GAP, S_TARGET_GAP, S_LATERAL, S_HEADING, S_SLOPE, SITUATION_COLUMNS = range(7)
 
 LOOK_AHEAD_S = np.arange(0.25, 3, 0.25)  # RegulatedRoad.is_conflict_possible: horizon 3 s, step 0.25 s
 MAX_STEERING_RAD = IDMVehicle.MAX_STEERING_ANGLE
 VEHICLE_END_M = AbstractLane.VEHICLE_LENGTH
+PURSUIT_S = IDMVehicle.TAU_PURSUIT
 
 
 class TrafficVehicle(IDMVehicle):
@@ -62,7 +67,7 @@ class TrafficVehicle(IDMVehicle):
     def resize(self, length: float, width: float) -> None:
         """Give this vehicle its own length and width (m); highway-env's dynamics and collisions use them."""
         self.LENGTH, self.WIDTH = length, width
-        self.diagonal = math.hypot(length, width)
+        self.diagonal = math.sqrt(length**2 + width**2)
 
 
 class ConnectedVehicle(TrafficVehicle):
@@ -108,6 +113,14 @@ class LaneTable:
         for row, links in enumerate(found):
             for k, (other, offset) in enumerate(links):
                 self.connected[row, k], self.offsets[row, k] = other, offset
+        self._circular = np.flatnonzero(self.rows[:, L_KIND] == CIRCULAR)
+
+    def angles(self, bodies: Array) -> Array:
+        """Direction (rad) of each body from the centre of each circular lane, (n, L); 0 for other lanes."""
+        out = np.zeros((len(bodies), len(self.rows)))
+        lanes = self.rows[self._circular]
+        out[:, self._circular] = np.arctan2(bodies[:, V_Y, None] - lanes[:, L_Y], bodies[:, V_X, None] - lanes[:, L_X])
+        return out
 
 
 def _lane_row(lane: AbstractLane) -> Array:
@@ -174,18 +187,21 @@ class FastRoad(RegulatedRoad):
         if not self.vehicles:
             return
         lanes = self.network.table
-        table = vehicle_table(self.vehicles, lanes)
-        ended = past_end(lanes.rows, table)
+        n = len(self.vehicles)
+        bodies = np.vstack([vehicle_table(self.vehicles, lanes), obstacle_table(self.objects)])
+        angles = lanes.angles(bodies)
+        ended = past_end(lanes.rows, bodies[:n], angles)
         for k, vehicle in enumerate(self.vehicles):
             if not vehicle.crashed:
                 _choose_lane(vehicle, bool(ended[k]))
-                table[k, V_TARGET] = lanes.row_of[vehicle.target_lane_index]
-        commands = idm_commands(lanes.rows, lanes.connected, lanes.offsets, table, obstacle_table(self.objects))
-        for vehicle, (acceleration, steering) in zip(self.vehicles, commands.tolist(), strict=True):
+                bodies[k, V_TARGET] = lanes.row_of[vehicle.target_lane_index]
+        seen = situations(lanes.rows, lanes.connected, lanes.offsets, bodies, n, angles)
+        accelerations, steering = idm_commands(bodies[:n], seen)
+        for vehicle, pedal, wheel in zip(self.vehicles, accelerations.tolist(), steering.tolist(), strict=True):
             if isinstance(vehicle, ConnectedVehicle):
-                vehicle.advised = (acceleration, steering)
+                vehicle.advised = (pedal, wheel)
             elif not vehicle.crashed:
-                vehicle.action = {"steering": steering, "acceleration": acceleration}
+                vehicle.action = {"steering": wheel, "acceleration": pedal}
 
     def step(self, dt: float) -> None:
         """Move all by `dt` s: `Road.step`, and on a regulated road the right of way twice a second."""
@@ -196,9 +212,22 @@ class FastRoad(RegulatedRoad):
             self.enforce_road_rules()
         lanes = self.network.table
         table = vehicle_table(self.vehicles, lanes)
-        closest = move(lanes.rows, table, dt, Vehicle.MAX_SPEED, Vehicle.MIN_SPEED)
-        self._write_back(table, closest, dt)
+        move(table, dt)
+        self._write_back(table, closest_lanes(lanes.rows, table), dt)
+        table[:, V_COS], table[:, V_SIN] = np.cos(table[:, V_HEADING]), np.sin(table[:, V_HEADING])
         self._handle_all_collisions(table, dt)
+
+    def neighbour_vehicles(self, vehicle: Any, lane_index: LaneIndex | None = None) -> tuple[Any, Any]:
+        """The ones ahead of and behind a vehicle on a lane: `Road.neighbour_vehicles`."""
+        lanes = self.network.table
+        others = [*self.vehicles, *(o for o in self.objects if not isinstance(o, Landmark))]
+        bodies = np.zeros((len(others), VEHICLE_COLUMNS))
+        bodies[:, :2] = [o.position for o in others]
+        row = lanes.row_of[lane_index or vehicle.lane_index]
+        me = others.index(vehicle)
+        found = neighbours(lanes.rows, lanes.connected, lanes.offsets, row, me, bodies, lanes.angles(bodies))
+        front, rear = (others[k] if k >= 0 else None for k in found)
+        return front, rear
 
     def enforce_road_rules(self) -> None:
         """Find conflicts and let one of each two yield: `RegulatedRoad.enforce_road_rules`."""
@@ -239,10 +268,10 @@ class FastRoad(RegulatedRoad):
         n = len(self.vehicles)
         if self.objects:
             table = np.vstack([table, obstacle_table(self.objects)])
-        for i, j, hits, will_hit, x, y in collisions(table, n, dt).tolist():
-            a, b = bodies[int(i)], bodies[int(j)]
+        for i, j, hits, will_hit in collisions(table, n, dt).tolist():
+            a, b = bodies[i], bodies[j]
             if will_hit:
-                shift = np.array([x, y])
+                _, _, shift = a._is_colliding(b, dt)
                 if j >= n:
                     a.impact = shift
                 else:
@@ -294,8 +323,8 @@ def vehicle_table(vehicles: list[TrafficVehicle], lanes: LaneTable) -> Array:
             )
         )
     table = np.zeros((len(rows), VEHICLE_COLUMNS))
-    if rows:
-        table[:, :VEHICLE_COLUMNS] = rows
+    table[:, :V_COS] = rows
+    table[:, V_COS], table[:, V_SIN] = np.cos(table[:, V_HEADING]), np.sin(table[:, V_HEADING])
     return table
 
 
@@ -306,6 +335,7 @@ def obstacle_table(objects: list[Any]) -> Array:
     for row, o in zip(table, solid, strict=True):
         row[V_X], row[V_Y], row[V_HEADING], row[V_SPEED] = o.position[0], o.position[1], o.heading, o.speed
         row[V_LENGTH], row[V_WIDTH] = o.LENGTH, o.WIDTH
+        row[V_COS], row[V_SIN] = np.cos(o.heading), np.sin(o.heading)
     return table
 
 
@@ -343,12 +373,14 @@ def not_zero(x: float) -> float:
 
 
 @njit(cache=True)
-def local_coordinates(lane: Array, x: float, y: float) -> tuple[float, float]:
-    """(longitudinal, lateral) m of a point on a lane: `AbstractLane.local_coordinates`."""
+def local_coordinates(lane: Array, x: float, y: float, angle: float) -> tuple[float, float]:
+    """(longitudinal, lateral) m of a point on a lane: `AbstractLane.local_coordinates`.
+
+    `angle` is the point's direction (rad) from the lane's centre, used by circular lanes only.
+    """
     dx, dy = x - lane[L_X], y - lane[L_Y]
     if lane[L_KIND] == CIRCULAR:
-        turned = wrap_to_pi(math.atan2(dy, dx) - lane[L_START_PHASE])
-        phi = lane[L_START_PHASE] + turned
+        phi = lane[L_START_PHASE] + wrap_to_pi(angle - lane[L_START_PHASE])
         longitudinal = lane[L_TURN] * (phi - lane[L_START_PHASE]) * lane[L_RADIUS]
         return longitudinal, lane[L_TURN] * (lane[L_RADIUS] - math.sqrt(dx * dx + dy * dy))
     longitudinal = dx * lane[L_DX] + dy * lane[L_DY]
@@ -359,14 +391,26 @@ def local_coordinates(lane: Array, x: float, y: float) -> tuple[float, float]:
 
 
 @njit(cache=True)
+def projected(lane: Array, x: float, y: float) -> tuple[float, float]:
+    """`local_coordinates` with the compiler's own arctangent: right to the last bit or two."""
+    angle = math.atan2(y - lane[L_Y], x - lane[L_X]) if lane[L_KIND] == CIRCULAR else 0.0
+    return local_coordinates(lane, x, y, angle)
+
+
+@njit(cache=True)
+def slope_at(lane: Array, longitudinal: float) -> float:
+    """Tangent of a sine lane's deviation from its axis."""
+    return lane[L_AMPLITUDE] * lane[L_PULSATION] * math.cos(lane[L_PULSATION] * longitudinal + lane[L_PHASE])
+
+
+@njit(cache=True)
 def heading_at(lane: Array, longitudinal: float) -> float:
     """Heading (rad) of a lane: `AbstractLane.heading_at`."""
     if lane[L_KIND] == CIRCULAR:
         phi = lane[L_TURN] * longitudinal / lane[L_RADIUS] + lane[L_START_PHASE]
         return phi + math.pi / 2 * lane[L_TURN]
     if lane[L_KIND] == SINE:
-        slope = lane[L_AMPLITUDE] * lane[L_PULSATION] * math.cos(lane[L_PULSATION] * longitudinal + lane[L_PHASE])
-        return lane[L_HEADING] + math.atan(slope)
+        return lane[L_HEADING] + math.atan(slope_at(lane, longitudinal))
     return lane[L_HEADING]
 
 
@@ -390,7 +434,7 @@ def closest_lane(lanes: Array, x: float, y: float, heading: float) -> int:
     best, best_distance = 0, np.inf
     for row in range(len(lanes)):
         lane = lanes[row]
-        s, lateral = local_coordinates(lane, x, y)
+        s, lateral = projected(lane, x, y)
         distance = abs(lateral) + max(s - lane[L_LENGTH], 0.0) + max(0.0 - s, 0.0)
         if not math.isnan(heading):
             if distance >= best_distance:
@@ -402,13 +446,22 @@ def closest_lane(lanes: Array, x: float, y: float, heading: float) -> int:
 
 
 @njit(cache=True)
-def past_end(lanes: Array, vehicles: Array) -> NDArray[np.bool_]:
+def closest_lanes(lanes: Array, vehicles: Array) -> Ints:
+    """Row (n,) of each vehicle's closest lane."""
+    rows = np.zeros(len(vehicles), dtype=np.int64)
+    for k in range(len(vehicles)):
+        rows[k] = closest_lane(lanes, vehicles[k, V_X], vehicles[k, V_Y], vehicles[k, V_HEADING])
+    return rows
+
+
+@njit(cache=True)
+def past_end(lanes: Array, vehicles: Array, angles: Array) -> NDArray[np.bool_]:
     """(n,) whether each vehicle has passed the end of its target lane: `AbstractLane.after_end`."""
     ended = np.zeros(len(vehicles), dtype=np.bool_)
     for k in range(len(vehicles)):
-        lane = lanes[int(vehicles[k, V_TARGET])]
-        s, _ = local_coordinates(lane, vehicles[k, V_X], vehicles[k, V_Y])
-        ended[k] = s > lane[L_LENGTH] - VEHICLE_END_M / 2
+        row = int(vehicles[k, V_TARGET])
+        s, _ = local_coordinates(lanes[row], vehicles[k, V_X], vehicles[k, V_Y], angles[k, row])
+        ended[k] = s > lanes[row, L_LENGTH] - VEHICLE_END_M / 2
     return ended
 
 
@@ -416,116 +469,127 @@ def past_end(lanes: Array, vehicles: Array) -> NDArray[np.bool_]:
 
 
 @njit(cache=True)
-def front_neighbour(
-    lanes: Array, connected: Ints, offsets: Array, row: int, me: int, vehicles: Array, obstacles: Array
-) -> int:
-    """Index of the one ahead of vehicle `me` on lane `row` (vehicles, then obstacles; -1: none).
-
-    `Road.neighbour_vehicles`, preceding vehicle only.
-    """
-    s, _ = local_coordinates(lanes[row], vehicles[me, V_X], vehicles[me, V_Y])
-    n = len(vehicles)
-    front, s_front = -1, np.inf
-    for k in range(n + len(obstacles)):
+def neighbours(
+    lanes: Array, connected: Ints, offsets: Array, row: int, me: int, bodies: Array, angles: Array
+) -> tuple[int, int]:
+    """Indices of the bodies ahead of and behind `me` on lane `row`, -1: none. `Road.neighbour_vehicles`."""
+    s, _ = local_coordinates(lanes[row], bodies[me, V_X], bodies[me, V_Y], angles[me, row])
+    front, rear, s_front, s_rear = -1, -1, np.inf, -np.inf
+    for k in range(len(bodies)):
         if k == me:
             continue
-        x, y = (vehicles[k, V_X], vehicles[k, V_Y]) if k < n else (obstacles[k - n, V_X], obstacles[k - n, V_Y])
         for c in range(connected.shape[1]):
-            if connected[row, c] < 0:
+            other = connected[row, c]
+            if other < 0:
                 break
-            lane = lanes[connected[row, c]]
-            s_k, lateral = local_coordinates(lane, x, y)
-            if not (abs(lateral) <= lane[L_WIDTH] / 2 + 1 and -VEHICLE_END_M <= s_k < lane[L_LENGTH] + VEHICLE_END_M):
+            s_k, lateral = local_coordinates(lanes[other], bodies[k, V_X], bodies[k, V_Y], angles[k, other])
+            inside = -VEHICLE_END_M <= s_k < lanes[other, L_LENGTH] + VEHICLE_END_M
+            if not (inside and abs(lateral) <= lanes[other, L_WIDTH] / 2 + 1):
                 continue
             s_k += offsets[row, c]
-            if s <= s_k and (front < 0 or s_k <= s_front):
+            if s <= s_k and s_k <= s_front:
                 front, s_front = k, s_k
+            if s_k < s and s_k > s_rear:
+                rear, s_rear = k, s_k
             break
-    return front
+    return front, rear
 
 
 @njit(cache=True)
-def idm_acceleration(lanes: Array, vehicles: Array, me: int, front: int, obstacles: Array) -> float:
-    """Acceleration (m/s^2) of the Intelligent Driver Model: `IDMVehicle.acceleration`."""
-    ego = vehicles[me]
-    lane = lanes[int(ego[V_LANE])]
-    wanted = ego[V_TARGET_SPEED]
-    if not math.isnan(lane[L_SPEED_LIMIT]):
-        wanted = min(max(wanted, 0.0), lane[L_SPEED_LIMIT])
-    acceleration = ego[V_COMFORT_MAX] * (1 - (max(ego[V_SPEED], 0.0) / abs(not_zero(wanted))) ** ego[V_DELTA])
-    if front < 0:
-        return acceleration
-    n = len(vehicles)
-    other = vehicles[front] if front < n else obstacles[front - n]
-    ahead, _ = local_coordinates(lane, other[V_X], other[V_Y])
-    here, _ = local_coordinates(lane, ego[V_X], ego[V_Y])
-    c, s = math.cos(ego[V_HEADING]), math.sin(ego[V_HEADING])
-    dvx = ego[V_SPEED] * c - other[V_SPEED] * math.cos(other[V_HEADING])
-    dvy = ego[V_SPEED] * s - other[V_SPEED] * math.sin(other[V_HEADING])
-    closing = dvx * c + dvy * s
+def relative_gap(lanes: Array, bodies: Array, me: int, front: int, angles: Array) -> float:
+    """Desired gap to the one ahead over the real one: `IDMVehicle.desired_gap` / `lane_distance_to`."""
+    ego, other = bodies[me], bodies[front]
+    row = int(ego[V_LANE])
+    ahead, _ = local_coordinates(lanes[row], other[V_X], other[V_Y], angles[front, row])
+    here, _ = local_coordinates(lanes[row], ego[V_X], ego[V_Y], angles[me, row])
+    dvx = ego[V_SPEED] * ego[V_COS] - other[V_SPEED] * other[V_COS]
+    dvy = ego[V_SPEED] * ego[V_SIN] - other[V_SPEED] * other[V_SIN]
+    closing = dvx * ego[V_COS] + dvy * ego[V_SIN]
     ab = -ego[V_COMFORT_MAX] * ego[V_COMFORT_MIN]
     gap = ego[V_DISTANCE] + ego[V_SPEED] * ego[V_TIME] + ego[V_SPEED] * closing / (2 * math.sqrt(ab))
-    return acceleration - ego[V_COMFORT_MAX] * (gap / not_zero(ahead - here)) ** 2
+    return gap / not_zero(ahead - here)
 
 
 @njit(cache=True)
-def clip(x: float, low: float, high: float) -> float:
-    """x limited to [low, high]."""
-    return min(max(x, low), high)
+def situations(lanes: Array, connected: Ints, offsets: Array, bodies: Array, n: int, angles: Array) -> Array:
+    """What each of the first n bodies sees, (n, SITUATION_COLUMNS).
 
-
-@njit(cache=True)
-def lane_steering(lane: Array, x: float, y: float, heading: float, speed: float, length: float) -> float:
-    """Steering angle (rad) that follows a lane: `ControlledVehicle.steering_control`."""
-    s, lateral = local_coordinates(lane, x, y)
-    future_heading = heading_at(lane, s + speed * 0.1)
-    lateral_speed = -(1 / 0.6) * lateral
-    heading_command = math.asin(clip(lateral_speed / not_zero(speed), -1.0, 1.0))
-    reference = future_heading + clip(heading_command, -math.pi / 4, math.pi / 4)
-    rate = 1 / 0.2 * wrap_to_pi(reference - heading)
-    slip = math.asin(clip(length / 2 / not_zero(speed) * rate, -1.0, 1.0))
-    return clip(math.atan(2 * math.tan(slip)), -MAX_STEERING_RAD, MAX_STEERING_RAD)
-
-
-@njit(cache=True)
-def idm_commands(lanes: Array, connected: Ints, offsets: Array, vehicles: Array, obstacles: Array) -> Array:
-    """(n, 2) acceleration (m/s^2) and steering (rad) of every vehicle: `IDMVehicle.act` after its choice of lane."""
-    commands = np.zeros((len(vehicles), 2))
-    for k in range(len(vehicles)):
-        v = vehicles[k]
+    Wanted speed, relative gaps on the own and the target lane (0: nobody ahead), offset from the target lane's centre,
+    and its heading and slope a moment ahead.
+    """
+    out = np.zeros((n, SITUATION_COLUMNS))
+    for k in range(n):
+        v = bodies[k]
         own, target = int(v[V_LANE]), int(v[V_TARGET])
-        front = front_neighbour(lanes, connected, offsets, own, k, vehicles, obstacles)
-        acceleration = idm_acceleration(lanes, vehicles, k, front, obstacles)
+        limit, wanted = lanes[own, L_SPEED_LIMIT], v[V_TARGET_SPEED]
+        out[k, S_WANTED] = wanted if math.isnan(limit) else min(max(wanted, 0.0), limit)
+        front, _ = neighbours(lanes, connected, offsets, own, k, bodies, angles)
+        if front >= 0:
+            out[k, S_GAP] = relative_gap(lanes, bodies, k, front, angles)
+        out[k, S_TARGET_GAP] = out[k, S_GAP]
         if own != target:
-            front = front_neighbour(lanes, connected, offsets, target, k, vehicles, obstacles)
-            acceleration = min(acceleration, idm_acceleration(lanes, vehicles, k, front, obstacles))
-        commands[k, 0] = clip(acceleration, -v[V_ACC_MAX], v[V_ACC_MAX])
-        commands[k, 1] = lane_steering(lanes[target], v[V_X], v[V_Y], v[V_HEADING], v[V_SPEED], v[V_LENGTH])
-    return commands
+            front, _ = neighbours(lanes, connected, offsets, target, k, bodies, angles)
+            out[k, S_TARGET_GAP] = relative_gap(lanes, bodies, k, front, angles) if front >= 0 else 0.0
+        s, lateral = local_coordinates(lanes[target], v[V_X], v[V_Y], angles[k, target])
+        ahead = s + v[V_SPEED] * PURSUIT_S
+        out[k, S_LATERAL] = lateral
+        if lanes[target, L_KIND] == SINE:
+            out[k, S_HEADING], out[k, S_SLOPE] = lanes[target, L_HEADING], slope_at(lanes[target], ahead)
+        else:
+            out[k, S_HEADING] = heading_at(lanes[target], ahead)
+    return out
+
+
+def idm_commands(vehicles: Array, seen: Array) -> tuple[Array, Array]:
+    """Acceleration (n,) m/s^2 and steering (n,) rad.
+
+    `IDMVehicle.acceleration` and `ControlledVehicle.steering_control`.
+    """
+    speed, comfort = vehicles[:, V_SPEED], vehicles[:, V_COMFORT_MAX]
+    ratio = np.maximum(speed, 0) / np.abs(not_zeros(seen[:, S_WANTED]))
+    free = comfort * (1 - np.power(ratio, vehicles[:, V_DELTA]))
+    acceleration = np.minimum(
+        free - comfort * np.power(seen[:, S_GAP], 2), free - comfort * np.power(seen[:, S_TARGET_GAP], 2)
+    )
+    moving = not_zeros(speed)
+    lateral_speed = -IDMVehicle.KP_LATERAL * seen[:, S_LATERAL]
+    heading_command = np.arcsin(_clip(lateral_speed / moving, 1.0))
+    reference = seen[:, S_HEADING] + np.arctan(seen[:, S_SLOPE]) + _clip(heading_command, np.pi / 4)
+    rate = IDMVehicle.KP_HEADING * (((reference - vehicles[:, V_HEADING] + np.pi) % (2 * np.pi)) - np.pi)
+    slip = np.arcsin(_clip(vehicles[:, V_LENGTH] / 2 / moving * rate, 1.0))
+    steering = _clip(np.arctan(2 * np.tan(slip)), MAX_STEERING_RAD)
+    return _clip(acceleration, vehicles[:, V_ACC_MAX]), steering
+
+
+def not_zeros(x: Array) -> Array:
+    """`highway_env.utils.not_zero` of each element."""
+    return np.where(np.abs(x) > 1e-2, x, np.where(x >= 0, 1e-2, -1e-2))
+
+
+def _clip(x: Array, bound: Any) -> Array:
+    return np.minimum(np.maximum(x, -bound), bound)
 
 
 # --- motion --------------------------------------------------------------------------------------------------------
 
 
-@njit(cache=True)
-def move(lanes: Array, vehicles: Array, dt: float, max_speed: float, min_speed: float) -> Ints:
-    """Advance the table by `dt` s (`Vehicle.step`, bicycle model) and return the closest lane (n,) of each."""
-    closest = np.zeros(len(vehicles), dtype=np.int64)
-    for k in range(len(vehicles)):
-        v = vehicles[k]
-        if v[V_CRASHED]:
-            v[V_STEERING], v[V_ACCELERATION] = 0.0, -1.0 * v[V_SPEED]
-        if v[V_SPEED] > max_speed:
-            v[V_ACCELERATION] = min(v[V_ACCELERATION], max_speed - v[V_SPEED])
-        elif v[V_SPEED] < min_speed:
-            v[V_ACCELERATION] = max(v[V_ACCELERATION], min_speed - v[V_SPEED])
-        beta = math.atan(0.5 * math.tan(v[V_STEERING]))
-        v[V_X] += v[V_SPEED] * math.cos(v[V_HEADING] + beta) * dt + v[V_IMPACT_X]
-        v[V_Y] += v[V_SPEED] * math.sin(v[V_HEADING] + beta) * dt + v[V_IMPACT_Y]
-        v[V_HEADING] += v[V_SPEED] * math.sin(beta) / (v[V_LENGTH] / 2) * dt
-        v[V_SPEED] += v[V_ACCELERATION] * dt
-        closest[k] = closest_lane(lanes, v[V_X], v[V_Y], v[V_HEADING])
-    return closest
+def move(vehicles: Array, dt: float) -> None:
+    """Advance the table by `dt` s in place: `Vehicle.step`, a bicycle model."""
+    crashed, speed = vehicles[:, V_CRASHED] > 0, vehicles[:, V_SPEED].copy()
+    steering = np.where(crashed, 0.0, vehicles[:, V_STEERING])
+    acceleration = np.where(crashed, -1.0 * speed, vehicles[:, V_ACCELERATION])
+    top, bottom = Vehicle.MAX_SPEED, Vehicle.MIN_SPEED
+    acceleration = np.where(speed > top, np.minimum(acceleration, top - speed), acceleration)
+    acceleration = np.where(speed < bottom, np.maximum(acceleration, bottom - speed), acceleration)
+    beta = np.arctan(0.5 * np.tan(steering))
+    course = vehicles[:, V_HEADING] + beta
+    vehicles[:, V_X] += speed * np.cos(course) * dt
+    vehicles[:, V_Y] += speed * np.sin(course) * dt
+    vehicles[:, V_X] += vehicles[:, V_IMPACT_X]
+    vehicles[:, V_Y] += vehicles[:, V_IMPACT_Y]
+    vehicles[:, V_HEADING] += speed * np.sin(beta) / (vehicles[:, V_LENGTH] / 2) * dt
+    vehicles[:, V_SPEED] += acceleration * dt
+    vehicles[:, V_STEERING], vehicles[:, V_ACCELERATION] = steering, acceleration
 
 
 # --- collisions ----------------------------------------------------------------------------------------------------
@@ -545,17 +609,12 @@ def corners(x: float, y: float, heading: float, length: float, width: float) -> 
 
 
 @njit(cache=True)
-def polygons_intersect(
-    a: Array, b: Array, ax: float, ay: float, bx: float, by: float
-) -> tuple[bool, bool, float, float]:
-    """Two rectangles displaced by (ax, ay) and (bx, by): intersecting, will intersect, translation (x, y).
+def rectangles_intersect(a: Array, b: Array, ax: float, ay: float, bx: float, by: float) -> tuple[bool, bool]:
+    """Whether two rectangles (4, 2) intersect now, and after moving by (ax, ay) and (bx, by).
 
-    `utils.are_polygons_intersecting`.
+    The yes or no of `utils.are_polygons_intersecting`.
     """
     intersecting, will_intersect = True, True
-    shortest, axis_x, axis_y = np.inf, 0.0, 0.0
-    toward_x = a[:, 0].mean() - b[:, 0].mean()
-    toward_y = a[:, 1].mean() - b[:, 1].mean()
     for polygon in (a, b):
         for k in range(4):
             nx = -(polygon[(k + 1) % 4, 1] - polygon[k, 1])
@@ -572,49 +631,53 @@ def polygons_intersect(
                 min_a += moved
             else:
                 max_a += moved
-            distance = min_b - max_a if min_a < min_b else min_a - max_b
-            if distance > 0:
+            if (min_b - max_a if min_a < min_b else min_a - max_b) > 0:
                 will_intersect = False
             if not intersecting and not will_intersect:
-                break
-            if abs(distance) < shortest:
-                shortest = abs(distance)
-                sign = 1.0 if toward_x * nx + toward_y * ny > 0 else -1.0
-                axis_x, axis_y = sign * nx, sign * ny
-    if will_intersect:
-        return intersecting, will_intersect, shortest * axis_x, shortest * axis_y
-    return intersecting, will_intersect, 0.0, 0.0
+                return False, False
+    return intersecting, will_intersect
 
 
 @njit(cache=True)
-def collisions(bodies: Array, n: int, dt: float) -> Array:
-    """Pairs (i, j) of bodies, i one of the first n, that touch or will within `dt` s.
+def diagonal(body: Array) -> float:
+    """Length (m) of a body's diagonal."""
+    return math.sqrt(body[V_LENGTH] ** 2 + body[V_WIDTH] ** 2)
 
-    Rows [i, j, intersecting, will intersect, translation x, y], in the order of `Road.step`: for every vehicle the
-    later vehicles, then all obstacles.
+
+@njit(cache=True)
+def outline(body: Array) -> Array:
+    """(4, 2) m corners of a body."""
+    return corners(body[V_X], body[V_Y], body[V_HEADING], body[V_LENGTH], body[V_WIDTH])
+
+
+@njit(cache=True)
+def collisions(bodies: Array, n: int, dt: float) -> Ints:
+    """Pairs of bodies, the first of them one of the first n, that touch or will within `dt` s.
+
+    Rows [i, j, intersecting, will intersect], in the order of `Road.step`: for every vehicle the later vehicles, then all
+    obstacles.
     """
-    found = []
+    found = [(0, 0, 0, 0)]
     for i in range(n):
         a = bodies[i]
         for j in range(i + 1, len(bodies)):
             b = bodies[j]
-            reach = (math.hypot(a[V_LENGTH], a[V_WIDTH]) + math.hypot(b[V_LENGTH], b[V_WIDTH])) / 2 + a[V_SPEED] * dt
+            reach = (diagonal(a) + diagonal(b)) / 2 + a[V_SPEED] * dt
             if math.sqrt((b[V_X] - a[V_X]) ** 2 + (b[V_Y] - a[V_Y]) ** 2) > reach:
                 continue
-            hits, will_hit, x, y = polygons_intersect(
-                corners(a[V_X], a[V_Y], a[V_HEADING], a[V_LENGTH], a[V_WIDTH]),
-                corners(b[V_X], b[V_Y], b[V_HEADING], b[V_LENGTH], b[V_WIDTH]),
-                a[V_SPEED] * math.cos(a[V_HEADING]) * dt,
-                a[V_SPEED] * math.sin(a[V_HEADING]) * dt,
-                b[V_SPEED] * math.cos(b[V_HEADING]) * dt,
-                b[V_SPEED] * math.sin(b[V_HEADING]) * dt,
+            hits, will_hit = rectangles_intersect(
+                outline(a),
+                outline(b),
+                a[V_SPEED] * a[V_COS] * dt,
+                a[V_SPEED] * a[V_SIN] * dt,
+                b[V_SPEED] * b[V_COS] * dt,
+                b[V_SPEED] * b[V_SIN] * dt,
             )
             if hits or will_hit:
-                found.append((float(i), float(j), 1.0 if hits else 0.0, 1.0 if will_hit else 0.0, x, y))
-    out = np.empty((len(found), 6))
-    for k in range(len(found)):
-        for c in range(6):
-            out[k, c] = found[k][c]
+                found.append((i, j, 1 if hits else 0, 1 if will_hit else 0))
+    out = np.empty((len(found) - 1, 4), dtype=np.int64)
+    for k in range(1, len(found)):
+        out[k - 1, 0], out[k - 1, 1], out[k - 1, 2], out[k - 1, 3] = found[k]
     return out
 
 
@@ -624,7 +687,7 @@ def collisions(bodies: Array, n: int, dt: float) -> Array:
 @njit(cache=True)
 def predicted_path(lanes: Array, vehicle: Array, route: Ints, times: Array) -> Array:
     """(t, 3) x, y, heading along the route at constant speed: `predict_trajectory_constant_speed`."""
-    s, _ = local_coordinates(lanes[int(vehicle[V_LANE])], vehicle[V_X], vehicle[V_Y])
+    s, _ = projected(lanes[int(vehicle[V_LANE])], vehicle[V_X], vehicle[V_Y])
     path = np.empty((len(times), 3))
     for k in range(len(times)):
         longitudinal = s + vehicle[V_SPEED] * times[k]
