@@ -121,8 +121,12 @@ class Engine:
         if self._client is None:
             self._client = connect()
             self._finalizer = weakref.finalize(self, _disconnect, self._client)
-            self.build(load_pybullet(), self._client)
+            self.build(self._pybullet, self._client)
         return self._client
+
+    @property
+    def _pybullet(self) -> ModuleType:
+        return load_pybullet()
 
     def build(self, p: ModuleType, client: int) -> None:
         """Load every shape and body, once per client."""
@@ -176,7 +180,7 @@ class BoxDynamics(Engine):
             half = [length / 2, width / 2, TALL_M / 2]
             shape = p.createCollisionShape(p.GEOM_BOX, halfExtents=half, physicsClientId=client)
             mass = 50.0 if body < n else 0.0
-            made = p.createMultiBody(mass, shape, -1, _limbo(body), physicsClientId=client)
+            made = p.createMultiBody(mass, shape, -1, limbo(body), physicsClientId=client)
             assert made == body
             if mass:
                 turning = mass * (length**2 + width**2) / 12
@@ -204,11 +208,11 @@ class BoxDynamics(Engine):
             raise ValueError(f"{len(planar)} obstacles given, built for {len(self._obstacle_sizes)}")
         self._obstacles = np.array(planar, dtype=np.float64).reshape(-1, 3)
         if self._client is not None:
-            self._place_obstacles(load_pybullet(), self._client)
+            self._place_obstacles(self._pybullet, self._client)
 
     def advance(self, state: BodyState, commands: Array) -> tuple[BodyState, NDArray[np.bool_]]:
         """See `Dynamics.advance`."""
-        client, p = self.client, load_pybullet()
+        client, p = self.client, self._pybullet
         set_velocity, get_pose = p.resetBaseVelocity, p.getBasePositionAndOrientation
         self._set_poses(p, client, state.planar)
         n = len(state.planar)
@@ -237,7 +241,7 @@ class BoxDynamics(Engine):
         """Set robots to planar poses (n, 3) with an empty contact cache."""
         set_pose = p.resetBasePositionAndOrientation
         for body in range(len(planar)):
-            set_pose(body, _limbo(body), (0.0, 0.0, 0.0, 1.0), client)
+            set_pose(body, limbo(body), (0.0, 0.0, 0.0, 1.0), client)
         p.performCollisionDetection(client)
         half = 0.5 * planar[:, 2]
         rows = np.column_stack([planar[:, :2], np.sin(half), np.cos(half)]).tolist()
@@ -247,7 +251,7 @@ class BoxDynamics(Engine):
     def _place_obstacles(self, p: ModuleType, client: int) -> None:
         n = len(self._robot_sizes)
         for k in range(len(self._obstacle_sizes)):
-            position, turn = _limbo(n + k), (0.0, 0.0, 0.0, 1.0)
+            position, turn = limbo(n + k), (0.0, 0.0, 0.0, 1.0)
             if k < len(self._obstacles):
                 x, y, heading = self._obstacles[k].tolist()
                 position, turn = (x, y, 0.0), (0.0, 0.0, np.sin(heading / 2), np.cos(heading / 2))
@@ -268,5 +272,6 @@ def wrapped(planar: Array) -> Array:
     return out
 
 
-def _limbo(body: int) -> tuple[float, float, float]:
-    return (LIMBO_M + 20.0 * body, LIMBO_M, 0.0)
+def limbo(body: int) -> tuple[float, float, float]:
+    """Where body number `body` stands while it is out of the way: far from everything and from every other one."""
+    return (LIMBO_M + 20.0 * body, LIMBO_M, 0.5 * LIMBO_M)

@@ -57,6 +57,7 @@ def models(scale: float = 1.0) -> tuple[Model, ...]:
         Model("barrier", shapes.scale(barrier(), scale), -1),
         Model("tree", tree(), -1),
         Model("shed", shed(), -1),
+        Model("wall", wall(), -1),
     )
     return robots + scenery
 
@@ -126,6 +127,15 @@ def tree() -> Mesh:
     return shapes.merge(
         shapes.cylinder(0.16, 2.0, BARK, sides=6, center=(0, 0, 1.0)),
         shapes.sphere((1.3, 1.3, 1.6), LEAF, rings=5, sides=8, center=(0, 0, 3.4)),
+    )
+
+
+def wall() -> Mesh:
+    """A panel of 2.5 x 0.1 x 2.2 m with a dark skirting."""
+    return shapes.merge(
+        shapes.box((2.5, 0.1, 2.2), center=(0, 0, 1.1)),
+        shapes.box((2.5, 0.14, 0.12), DARK, (0, 0, 0.06)),
+        shapes.box((0.06, 0.12, 2.2), (190, 190, 190), (1.22, 0, 1.1)),
     )
 
 

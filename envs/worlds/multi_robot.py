@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 from .robots import RobotSceneParams, RobotWorld
@@ -18,3 +19,33 @@ class MultiRobotWorld(RobotWorld):
     def __init__(self, n_observers: int = 2, params: MultiRobotParams | None = None) -> None:
         """Raises ValueError for a number of observers that does not fit."""
         super().__init__(n_observers, params or MultiRobotParams())
+
+
+PRESETS = {
+    "easy": MultiRobotParams(
+        n_team=8, n_obstacles=(0, 2), observer_angle_deg=(20.0, 60.0), observer_gaze_m=1.5, unique_share=0.5
+    ),
+    "paper": MultiRobotParams(
+        n_team=28,
+        n_obstacles=(4, 7),
+        team_radius_m=(8.0, 10.0),
+        observer_angle_deg=(50.0, 128.0),
+        observer_gaze_m=5.0,
+    ),
+    "hard": MultiRobotParams(
+        n_team=36,
+        n_obstacles=(7, 11),
+        team_radius_m=(9.5, 11.5),
+        observer_distance_m=(10.0, 14.0),
+        observer_angle_deg=(60.0, 140.0),
+        observer_gaze_m=5.0,
+        camera_height_m=(0.65, 0.8),
+    ),
+}
+
+
+def preset(name: str) -> MultiRobotParams:
+    """The parameters called `name`: easy, paper or hard. Raises ValueError for another name."""
+    if name not in PRESETS:
+        raise ValueError(f"unknown preset {name!r}; multi_robot has {', '.join(PRESETS)}")
+    return dataclasses.replace(PRESETS[name])

@@ -21,6 +21,7 @@ from .layout import check_layouts, in_disc, observers_around, place_apart, team_
 from .lighting import check_times, sample_light
 from .models import ROBOT_CLASSES, Model, models
 from .team import TeamRoutes, advance_waypoints, draw_routes, team_commands
+from .wheels import WheelDynamics
 from .world import Array, Light, SceneGenerationError, Snapshot
 
 Range = tuple[float, float]
@@ -42,7 +43,9 @@ class RobotSceneParams:
         n_obstacles: things that stand around and hide others.
         obstacles: "scenery" (not objects: nobody detects them), "crate" (identical objects) or "husky" (objects that
             look like the robots).
+        obstacle_distance_m: observers start no nearer to an obstacle, where there is room.
         n_backdrop: trees and sheds beyond the arena.
+        backdrop: "yard" (those) or "lab" (walls around the arena, no trees).
         scale: size of robots and obstacles relative to a Husky of 0.97 m.
         team_radius_m: the team starts and stays within this distance of the origin.
         layouts: how the team stands at first; one is drawn.
@@ -65,7 +68,9 @@ class RobotSceneParams:
     n_team: int = 15
     n_obstacles: tuple[int, int] = (3, 6)
     obstacles: str = "scenery"
+    obstacle_distance_m: float = 3.0
     n_backdrop: tuple[int, int] = (6, 12)
+    backdrop: str = "yard"
     scale: float = 1.0
     team_radius_m: Range = (6.5, 8.5)
     layouts: tuple[str, ...] = ("scatter", "clusters", "rows", "ring")
@@ -88,35 +93,34 @@ class RobotSceneParams:
     def __post_init__(self) -> None:
         """Raise ValueError naming the first impossible value."""
         for name in ("n_team",):
-            _require(getattr(self, name) >= 0, name, getattr(self, name), "at least 0")
+            require(getattr(self, name) >= 0, name, getattr(self, name), "at least 0")
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if isinstance(value, tuple) and len(value) == 2 and not isinstance(value[0], str):
-                _require(all(map(math.isfinite, value)), field.name, value, "finite")
-                _require(value[0] <= value[1], field.name, value, "a pair (low, high) with low <= high")
+                require(all(map(math.isfinite, value)), field.name, value, "finite")
+                require(value[0] <= value[1], field.name, value, "a pair (low, high) with low <= high")
                 if not field.name.endswith("_deg"):
-                    _require(value[0] >= 0, field.name, value, "a pair of non-negative numbers")
+                    require(value[0] >= 0, field.name, value, "a pair of non-negative numbers")
             if isinstance(value, float):
-                _require(math.isfinite(value), field.name, value, "finite")
+                require(math.isfinite(value), field.name, value, "finite")
         for name in ("scale", "separation_m", "max_speed_mps", "max_turn_radps", "step_seconds"):
-            _require(getattr(self, name) > 0, name, getattr(self, name), "positive")
+            require(getattr(self, name) > 0, name, getattr(self, name), "positive")
         for name in ("moving_share", "unique_share"):
-            _require(0 <= getattr(self, name) <= 1, name, getattr(self, name), "in [0, 1]")
-        _require(self.team_radius_m[0] > 0, "team_radius_m", self.team_radius_m, "positive")
-        _require(self.camera_height_m[0] > 0, "camera_height_m", self.camera_height_m, "positive")
-        _require(self.observer_gaze_m >= 0, "observer_gaze_m", self.observer_gaze_m, "at least 0")
-        _require(1 <= self.horizontal_fov_deg < 179, "horizontal_fov_deg", self.horizontal_fov_deg, "in [1, 179)")
-        _require(self.camera_tilt_deg[0] >= -90, "camera_tilt_deg", self.camera_tilt_deg, "in [-90, 90]")
-        _require(self.camera_tilt_deg[1] <= 90, "camera_tilt_deg", self.camera_tilt_deg, "in [-90, 90]")
-        _require(
-            self.obstacles in ("scenery", "crate", "husky"), "obstacles", self.obstacles, "scenery, crate or husky"
-        )
-        _require(self.dynamics in ("box", "wheels"), "dynamics", self.dynamics, '"box" or "wheels"')
+            require(0 <= getattr(self, name) <= 1, name, getattr(self, name), "in [0, 1]")
+        require(self.team_radius_m[0] > 0, "team_radius_m", self.team_radius_m, "positive")
+        require(self.camera_height_m[0] > 0, "camera_height_m", self.camera_height_m, "positive")
+        require(self.observer_gaze_m >= 0, "observer_gaze_m", self.observer_gaze_m, "at least 0")
+        require(1 <= self.horizontal_fov_deg < 179, "horizontal_fov_deg", self.horizontal_fov_deg, "in [1, 179)")
+        require(self.camera_tilt_deg[0] >= -90, "camera_tilt_deg", self.camera_tilt_deg, "in [-90, 90]")
+        require(self.camera_tilt_deg[1] <= 90, "camera_tilt_deg", self.camera_tilt_deg, "in [-90, 90]")
+        require(self.obstacles in ("scenery", "crate", "husky"), "obstacles", self.obstacles, "scenery, crate or husky")
+        require(self.backdrop in ("yard", "lab"), "backdrop", self.backdrop, '"yard" or "lab"')
+        require(self.dynamics in ("box", "wheels"), "dynamics", self.dynamics, '"box" or "wheels"')
         check_layouts(self.layouts)
         check_times(self.times_of_day)
         footprint = math.pi * (0.5 * self.separation_m) ** 2
         room = math.pi * (self.team_radius_m[1] + 0.5 * self.separation_m) ** 2
-        _require(
+        require(
             0.5 * room >= self.n_team * footprint,
             "n_team",
             self.n_team,
@@ -156,7 +160,8 @@ class State:
     """What changes: time, robots on the ground, waypoints (t,), what collided (N,), flying observers.
 
     Attributes:
-        flight: (f, 8) of each flying observer: x, y, z m, heading rad, their rates in the world frame.
+        flight: (f, 10) of each flying observer: x, y, z m, heading rad, their rates in the world frame, then pitch and
+            roll in rad.
     """
 
     time: float
@@ -296,7 +301,7 @@ class RobotWorld:
     # ------------------------------------------------------------------ generation
 
     def _generate(self, rng: np.random.Generator) -> tuple[Scene, Array, Array]:
-        """A scene, planar poses (r - f, 3) of the robots on the ground and (f, 8) of those in the air."""
+        """A scene, planar poses (r - f, 3) of the robots on the ground and (f, 10) of those in the air."""
         p = self.params
         radius = rng.uniform(*p.team_radius_m)
         team = self._place_team(rng, radius)
@@ -348,7 +353,7 @@ class RobotWorld:
         )
 
     def _place_flyers(self, rng: np.random.Generator) -> Array:
-        return np.zeros((0, 8))
+        return np.zeros((0, 10))
 
     def _place_obstacles(self, rng: np.random.Generator, radius: float, robots: Array) -> Array:
         p = self.params
@@ -356,14 +361,24 @@ class RobotWorld:
         name = "husky" if p.obstacles == "husky" else "crate" if p.obstacles == "crate" else "container"
         half = 0.5 * float(np.hypot(*self.models[self._index(name)].size[:2]))
         clearance = max(p.separation_m, half + 0.6 * p.scale)
-        spots = place_apart(
-            lambda i: in_disc(rng, radius), k, p.separation_m, "obstacle", taken=robots[:, :2], clearance_m=clearance
-        )
+        observers = robots[: self.n_robots - self.n_flyers, :2]
+
+        def draw(i: int) -> Array:
+            for _ in range(20):  # right before a camera, an obstacle would hide everything
+                spot = in_disc(rng, radius)
+                if (np.hypot(*(observers - spot).T) > p.obstacle_distance_m).all():
+                    break
+            return spot
+
+        apart = max(p.separation_m, 2.0 * half)
+        spots = place_apart(draw, k, apart, "obstacle", taken=robots[:, :2], clearance_m=clearance)
         return np.column_stack([spots, rng.uniform(-np.pi, np.pi, k)])
 
     def _backdrop(self, rng: np.random.Generator) -> tuple[Array, NDArray[np.int64], Array]:
         """Trees and sheds beyond the arena: poses, models, tints."""
         p = self.params
+        if p.backdrop == "lab":
+            return self._walls(rng)
         k = int(rng.integers(p.n_backdrop[0], p.n_backdrop[1] + 1))
         angle = rng.uniform(-np.pi, np.pi, k)
         edge = max(p.team_radius_m[1], p.observer_distance_m[1]) + 8.0
@@ -374,6 +389,18 @@ class RobotWorld:
         planar = np.column_stack([distance * np.cos(angle), distance * np.sin(angle), heading])
         return planar_poses(planar), names.astype(np.int64), tints
 
+    def _walls(self, rng: np.random.Generator) -> tuple[Array, NDArray[np.int64], Array]:
+        """A square room about the arena, of panels 2.5 m long."""
+        half = 1.25 * math.ceil((max(self.params.team_radius_m[1], self.params.observer_distance_m[1]) + 1.0) / 1.25)
+        along = np.arange(-half + 1.25, half, 2.5)
+        sides = [np.column_stack([along, np.full_like(along, half), np.zeros_like(along)])]
+        for _ in range(3):
+            x, y, heading = sides[-1].T
+            sides.append(np.column_stack([-y, x, heading + np.pi / 2]))
+        planar = np.vstack(sides)
+        tint = np.tile(rng.uniform(0.6, 0.95, 3), (len(planar), 1))
+        return planar_poses(planar), np.full(len(planar), self._index("wall"), dtype=np.int64), tint
+
     def _looks(self, rng: np.random.Generator) -> tuple[NDArray[np.int64], Array]:
         """Model (r,) and tint (r, 3) of each robot: one look for all but the unique ones."""
         p = self.params
@@ -382,7 +409,7 @@ class RobotWorld:
         fleet = np.array(FLEET_COLORS[int(rng.integers(len(FLEET_COLORS)))], dtype=np.float64)
         tints = np.tile(np.clip(fleet + rng.uniform(-12, 12, 3), 0, 255) / 255.0, (self._n_objects, 1))
         unique = round(p.unique_share * p.n_team)
-        for i, color in zip(range(unique), rng.permutation(len(UNIQUE_COLORS)).repeat(unique), strict=False):
+        for i, color in enumerate(np.resize(rng.permutation(len(UNIQUE_COLORS)), unique)):
             at = self.n_robots + i
             model[at] = self._index(UNIQUE_MODELS[int(rng.integers(len(UNIQUE_MODELS)))])
             tints[at] = np.clip(np.array(UNIQUE_COLORS[int(color)]) + rng.uniform(-12, 12, 3), 0, 255) / 255.0
@@ -422,8 +449,8 @@ class RobotWorld:
         return robot_poses @ scene.T_robot_camera
 
     def _robot_state(self, state: State) -> Array:
-        """(N, 2): speed along the heading, turn rate."""
-        n = self.n_robots
+        """(N - f, 2) of the observers on the ground: speed along the heading, turn rate."""
+        n = self.n_robots - self.n_flyers
         planar, velocity = state.bodies.planar[:n], state.bodies.velocity[:n]
         forward = velocity[:, 0] * np.cos(planar[:, 2]) + velocity[:, 1] * np.sin(planar[:, 2])
         return np.column_stack([forward, velocity[:, 2]])
@@ -438,7 +465,12 @@ class RobotWorld:
         self._object_classes = np.array([model.object_class for model in self.models], dtype=np.int64)
         obstacle = "container" if p.obstacles == "scenery" else p.obstacles
         robots = np.tile(self._sizes[self._index("husky"), :2], (grounded, 1))
+        unique = round(p.unique_share * p.n_team)
+        first = self.n_robots - self.n_flyers
+        robots[first : first + unique] = self._sizes[[self._index(name) for name in UNIQUE_MODELS], :2].max(0)
         obstacles = np.tile(self._sizes[self._index(obstacle), :2], (p.n_obstacles[1], 1))
+        if p.dynamics == "wheels":
+            return WheelDynamics(grounded, obstacles, scale=p.scale, step_seconds=p.step_seconds)
         return BoxDynamics(robots, obstacles, step_seconds=p.step_seconds)
 
     def _index(self, name: str) -> int:
@@ -505,6 +537,7 @@ def _checked_observers(n_observers: int, params: RobotSceneParams) -> int:
     return int(n_observers)
 
 
-def _require(ok: bool, name: str, value: object, wanted: str) -> None:
+def require(ok: bool, name: str, value: object, wanted: str) -> None:
+    """Raise ValueError naming a parameter, what it must be and what it is, unless `ok`."""
     if not ok:
         raise ValueError(f"{name} must be {wanted}, got {value!r}")
