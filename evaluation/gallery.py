@@ -27,7 +27,7 @@ class Picture:
 def correspondence_pictures(
     scene: str, methods: Sequence[Method], settings: Settings, folder: Path, episode: int = 0
 ) -> list[Picture]:
-    """Save the scene and every method's matches, of the episode's frame with the most objects detected by both robots."""
+    """Save the scene and every method's matches, of the episode's frame with the most objects that both detected."""
     env = make_env(scene, settings, render_mode="rgb_array")
     best = -1
     images: dict[str, NDArray[np.uint8]] = {}

@@ -6,8 +6,9 @@ import pytest
 
 from covis.evaluation.datasets import load_dataset, true_relative_pose
 from covis.evaluation.mrclam import (
+    UNCALIBRATED,
     MrclamError,
-    calibrated_odometry,
+    calibrate,
     import_mrclam,
     integrate_odometry,
     pose_at,
@@ -170,7 +171,7 @@ def test_dead_reckoning_of_an_arc_is_exact():
     np.testing.assert_allclose(pose_at(track, 5.0)[:2, 3], state(1, 5.0)[:2], atol=1e-9)
 
 
-def test_odometry_that_runs_ahead_is_calibrated_on_landmarks_alone():
+def test_odometry_and_ranges_are_calibrated_on_landmarks_alone():
     rng = np.random.default_rng(0)
     times = np.arange(0, 200, 0.1)
     speed = 0.1 * np.ones_like(times)
@@ -185,15 +186,19 @@ def test_odometry_that_runs_ahead_is_calibrated_on_landmarks_alone():
             bearing = (np.arctan2(ly - y, lx - x) - heading + np.pi) % (2 * np.pi) - np.pi
             if abs(bearing) < 0.6:
                 r = np.hypot(lx - x, ly - y)
-                readings.append((t, barcode, r + 0.01 * rng.normal(), bearing + 0.005 * rng.normal()))
+                depth = (r + 0.01 * rng.normal()) * np.cos(bearing)
+                readings.append((t, barcode, depth, bearing + 0.005 * rng.normal()))
     readings = np.array(readings)
+    calibration = calibrate(odometry, readings, set(landmarks))
+    assert calibration.delay_s == pytest.approx(0.2, abs=0.051)
+    assert calibration.turn_gain == pytest.approx(0.92, abs=0.02)
+    assert calibration.axis_exponent == pytest.approx(1.0, abs=0.1)
 
     def drift(track):
         moved = [invert(pose_at(track, t)) @ pose_at(track, t + 1) for t in range(5, 190, 5)]
         true = [invert(pose_at(real, t)) @ pose_at(real, t + 1) for t in range(5, 190, 5)]
         return np.std([np.arctan2(*(invert(a) @ b)[[1, 0], [0, 0]]) for a, b in zip(moved, true, strict=True)])
 
-    assert drift(calibrated_odometry(odometry, readings, set(landmarks))) < 0.2 * drift(integrate_odometry(odometry))
-    np.testing.assert_array_equal(
-        calibrated_odometry(odometry, readings[:50], set(landmarks)).states, integrate_odometry(odometry).states
-    )
+    assert drift(calibration.dead_reckoning(odometry)) < 0.2 * drift(integrate_odometry(odometry))
+    assert calibrate(odometry, readings[:50], set(landmarks)) == UNCALIBRATED
+    np.testing.assert_array_equal(UNCALIBRATED.readings(readings), readings)

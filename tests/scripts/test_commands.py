@@ -1,0 +1,86 @@
+"""The command line, as a person calls it."""
+
+import json
+import sys
+
+import pytest
+from typer.testing import CliRunner
+
+from covis.scripts.main import app
+
+runner = CliRunner()
+
+
+def test_benchmark_prints_json(small_dataset):
+    result = runner.invoke(
+        app,
+        [
+            "benchmark",
+            str(small_dataset),
+            "--method",
+            "oracle",
+            "--method",
+            "hungarian:gate_m=2",
+            "--pose",
+            "known",
+            "--json",
+            "-",
+        ],
+    )
+    assert result.exit_code == 0, result.output
+    rows = json.loads(result.stdout)["rows"]
+    assert [row["method"] for row in rows] == ["oracle", "hungarian"]
+    assert rows[0]["f1"] == 1.0
+
+
+def test_benchmark_writes_a_file_and_a_table(small_dataset, tmp_path):
+    file = tmp_path / "rows.json"
+    result = runner.invoke(app, ["benchmark", str(small_dataset), "--method", "reid", "--json", str(file)])
+    assert result.exit_code == 0, result.output
+    assert "reid" in result.stdout
+    assert json.loads(file.read_text())["rows"][0]["target"] == "small"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--method", "hungarian"], "hungarian needs a relative pose"),
+        (["--method", "nope"], "no matcher is called 'nope'"),
+        (["--method", "reid:colour=3"], "colour"),
+        (["--pose", "maybe"], "pose must be one of"),
+        (["--resume"], "--resume needs --out"),
+        (["--method", "reid", "--workers", "0"], "workers must be at least 1, got 0"),
+    ],
+)
+def test_mistakes_are_one_line_and_status_2(small_dataset, arguments, message):
+    result = runner.invoke(app, ["benchmark", str(small_dataset), *arguments])
+    assert result.exit_code == 2
+    assert message in result.stderr
+    assert "Traceback" not in result.output
+
+
+def test_matching_imports_neither_simulators_nor_torch():
+    import subprocess
+
+    code = (
+        "import sys, covis.matching, covis.fusion, covis.evaluation.benchmark, covis.scripts.main; "
+        "print([m for m in ('torch', 'pybullet', 'highway_env', 'pettingzoo', 'gymnasium', 'cv2') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.slow
+def test_demo_makes_a_report(tmp_path):
+    from covis.evaluation.benchmark import SCENE_NAMES
+    from covis.evaluation.demo import METHODS
+
+    result = runner.invoke(app, ["demo", "--out", str(tmp_path)])
+    assert result.exit_code == 0, result.output
+    rows = json.loads((tmp_path / "rows.json").read_text())["rows"]
+    assert len(rows) == len(METHODS) * len(SCENE_NAMES)
+    assert all(row["displacement_fused_m"] is not None for row in rows if row["method"] == "oracle")
+    report = (tmp_path / "report.md").read_text()
+    for scene in SCENE_NAMES:
+        assert (tmp_path / "pictures" / f"{scene}-oracle.png").stat().st_size > 10_000
+        assert f"pictures/{scene}-oracle.png" in report
