@@ -13,8 +13,11 @@ from pettingzoo.utils.conversions import parallel_to_aec
 from .collaborative import CollaborativeEnv
 from .scoring import LocalizationReward
 from .sensing import PoseNoise
+from .worlds import aerial_ground, multi_robot, target_localization
+from .worlds.aerial_ground import AerialGroundWorld
 from .worlds.driving import ConnectedDrivingWorld
 from .worlds.multi_robot import MultiRobotWorld
+from .worlds.target_localization import TargetLocalizationWorld
 from .worlds.world import World
 
 
@@ -49,7 +52,15 @@ SCENES: dict[str, Scene] = {
     "connected_driving": Scene(
         ConnectedDrivingWorld, _default_params, 2, PoseNoise(1.0, 0.0175), LocalizationReward(cap_m=5.0)
     ),
-    "multi_robot": Scene(MultiRobotWorld, _default_params, 2, PoseNoise(0.3, 0.02), LocalizationReward(cap_m=2.0)),
+    "multi_robot": Scene(
+        MultiRobotWorld, multi_robot.preset, 2, PoseNoise(0.3, 0.02), LocalizationReward(cap_m=2.0)
+    ),
+    "aerial_ground": Scene(
+        AerialGroundWorld, aerial_ground.preset, 2, PoseNoise(0.2, 0.02), LocalizationReward(cap_m=2.0)
+    ),
+    "target_localization": Scene(
+        TargetLocalizationWorld, target_localization.preset, 2, PoseNoise(0.02, 0.01), LocalizationReward(cap_m=0.5)
+    ),
 }
 
 

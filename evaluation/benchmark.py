@@ -12,7 +12,7 @@ from .methods import Method
 from .records import summarise
 from .settings import Settings
 
-SCENE_NAMES = ("connected_driving", "multi_robot")
+SCENE_NAMES = ("connected_driving", "multi_robot", "aerial_ground", "target_localization")
 """As in `covis.envs.scenes.SCENES`, which needs the simulators; a test compares the two."""
 
 
