@@ -6,9 +6,11 @@ x, y, heading from motion capture). A frame is one window of time; a robot's rea
 end by its odometry, and the readings of one barcode become one detection. The barcode is the identity, which no
 matcher sees.
 
-The odometry is what the robots were told to do, not what they did: on sequence 6 the motion follows 0.2 to 0.25 s
-later, and turns are 0.91 to 0.95 as large. Each robot's odometry is therefore calibrated on how its own readings of
-landmarks move from one moment to the next; no motion capture is used, and short logs are left as they are.
+Two things in these logs are not what their headers say. The odometry is what the robots were told to do: on sequence 6
+the motion follows 0.2 to 0.25 s later, and turns are 0.91 to 0.95 as large. And the range is the distance along the
+optical axis, short by the cosine of the bearing: that explains 92 to 98 % of its error's variance there. Both show
+without any truth, in how a robot's readings of a landmark that stands still move from one moment to the next, and are
+calibrated from them, robot by robot; short logs are left as they are.
 
 Robot frame: x forward, y left, z up; everything lies in the plane z = 0.
 """
@@ -42,6 +44,9 @@ MIN_CALIBRATION_PAIRS = 300
 """Successive readings of landmarks below which odometry is not calibrated."""
 CALIBRATION_DELAYS_S = tuple(0.05 * k for k in range(9))
 """Delays of the motion behind the odometry that are tried, s."""
+CAMERA_RANGE_SCALE = 1.036
+"""Depth that the platform's cameras report over true depth: 1.025 to 1.052 on the five robots of sequence 6, measured
+there with motion capture; a robot's own readings cannot tell it."""
 MAX_TRUTH_GAP_S = 2.5
 """Longest gap between motion-capture samples that is bridged, s."""
 
@@ -52,10 +57,7 @@ class MrclamError(ValueError):
 
 @dataclass(frozen=True)
 class RangeBearingNoise:
-    """1 sigma of one reading, measured on sequence 6.
-
-    Successive readings of one barcode are wrong together (correlation 0.95 of the range error), so the readings of a
-    window count as one.
+    """1 sigma of one reading. Successive readings of a barcode are wrong together, so those of a window count as one.
 
     Attributes:
         range_std_m: at distance 0. range_std_per_m: added per metre of range.
@@ -69,6 +71,12 @@ class RangeBearingNoise:
     bearing_std_rad: float = 0.012
     turn_rate_std_rad_s: float = 0.02
     height_std_m: float = 0.01
+
+
+RAW_NOISE = RangeBearingNoise()
+"""Readings as they are; measured on sequence 6."""
+CALIBRATED_NOISE = RangeBearingNoise(range_std_m=0.015, range_std_per_m=0.015)
+"""Readings of a calibrated robot; measured on sequence 6."""
 
 
 @dataclass(frozen=True)
@@ -96,14 +104,15 @@ class RobotLog:
     Attributes:
         name: "robot_<i>".
         number: i, which is also its identity as an object.
-        readings: (k, 4) time s, barcode, range m, bearing rad.
-        dead_reckoning: odometry integrated from an arbitrary start.
+        readings: (k, 4) time s, barcode, range m, bearing rad; corrected where `calibrated`.
+        dead_reckoning: odometry integrated from an arbitrary start; likewise.
         truth: motion capture.
     """
 
     name: str
     number: int
     readings: Array
+    calibrated: bool
     dead_reckoning: Track
     truth: Track
 
@@ -117,7 +126,7 @@ def import_mrclam(
         source: folder with the raw files (or with one subfolder that has them), or a .tar.*, .tgz or .zip of it.
         out: folder to write.
         window: length of a frame, s.
-        noise: error of a reading.
+        noise: error of a reading; None = as measured on sequence 6, see RAW_NOISE and CALIBRATED_NOISE.
 
     Raises:
         MrclamError: a file that is missing, malformed or empty, or robots whose times do not overlap.
@@ -125,7 +134,6 @@ def import_mrclam(
     """
     if not window > 0:
         raise ValueError(f"window must be a positive number of seconds, got {window}")
-    noise = noise or RangeBearingNoise()
     with _raw_folder(Path(source)) as folder:
         subjects = _read_barcodes(folder / "Barcodes.dat")
         landmarks = _read_landmarks(folder / "Landmark_Groundtruth.dat")
@@ -217,13 +225,15 @@ def _read_robot(folder: Path, number: int, landmark_barcodes: Set[int]) -> Robot
     readings, truth = tables["Measurement"], tables["Groundtruth"]
     if (readings[:, 2] < 0).any():
         raise MrclamError(f"Robot{number}_Measurement.dat: negative range {readings[:, 2].min()}")
+    calibration = calibrate(tables["Odometry"], readings, landmark_barcodes)
     states = truth[:, 1:].copy()
     states[:, 2] = np.unwrap(states[:, 2])
     return RobotLog(
         name=f"robot_{number}",
         number=number,
-        readings=readings,
-        dead_reckoning=calibrated_odometry(tables["Odometry"], readings, landmark_barcodes),
+        readings=calibration.readings(readings),
+        calibrated=calibration != UNCALIBRATED,
+        dead_reckoning=calibration.dead_reckoning(tables["Odometry"]),
         truth=Track(truth[:, 0], states),
     )
 
@@ -243,8 +253,40 @@ def integrate_odometry(odometry: Array) -> Track:
     return Track(times, states)
 
 
-def calibrated_odometry(odometry: Array, readings: Array, landmark_barcodes: Set[int]) -> Track:
-    """Dead reckoning with the delay, speed gain and turn gain that explain best how static barcodes move in view.
+@dataclass(frozen=True)
+class Calibration:
+    """What a robot's own readings say about its odometry and its camera.
+
+    Attributes:
+        delay_s: of the motion behind the odometry.
+        speed_gain, turn_gain: real motion over odometry.
+        axis_exponent, range_scale: true range = reading / (range_scale * cos(bearing) ** axis_exponent); the exponent
+            is 0 for a range, 1 for a depth along the axis.
+    """
+
+    delay_s: float
+    speed_gain: float
+    turn_gain: float
+    axis_exponent: float
+    range_scale: float = 1.0
+
+    def dead_reckoning(self, odometry: Array) -> Track:
+        """Corrected odometry (k, 3), integrated."""
+        gains = np.array([self.speed_gain, self.turn_gain])
+        return integrate_odometry(np.column_stack([odometry[:, 0] + self.delay_s, odometry[:, 1:] * gains]))
+
+    def readings(self, readings: Array) -> Array:
+        """Readings (n, 4) with their range corrected."""
+        corrected = readings.copy()
+        corrected[:, 2] /= self.range_scale * np.maximum(np.cos(readings[:, 3]), 0.1) ** self.axis_exponent
+        return corrected
+
+
+UNCALIBRATED = Calibration(0.0, 1.0, 1.0, 0.0)
+
+
+def calibrate(odometry: Array, readings: Array, landmark_barcodes: Set[int]) -> Calibration:
+    """The calibration that explains best how barcodes that stand still move in view.
 
     Args:
         odometry: (k, 3) time s, speed m/s, turn rate rad/s.
@@ -252,26 +294,26 @@ def calibrated_odometry(odometry: Array, readings: Array, landmark_barcodes: Set
         landmark_barcodes: barcodes that do not move.
 
     Returns:
-        The odometry as it is where fewer than MIN_CALIBRATION_PAIRS successive readings exist.
+        UNCALIBRATED where there are fewer than MIN_CALIBRATION_PAIRS successive readings.
     """
     before, after = _successive(readings, landmark_barcodes)
     if len(before) < MIN_CALIBRATION_PAIRS:
-        return integrate_odometry(odometry)
+        return UNCALIBRATED
 
-    def track(delay: float, gains: Array) -> Track:
-        return integrate_odometry(np.column_stack([odometry[:, 0] + delay, odometry[:, 1:] * gains]))
+    def errors(x: Array, delay: float) -> Array:
+        trial = Calibration(delay, float(x[0]), float(x[1]), float(x[2]))
+        return _prediction_errors(trial.dead_reckoning(odometry), trial.readings(before), trial.readings(after))
 
+    start = np.array([1.0, 1.0, 0.0])
     fits = []
     for delay in CALIBRATION_DELAYS_S:
-        fit = least_squares(
-            lambda gains, delay=delay: _prediction_errors(track(delay, gains), before, after),
-            np.ones(2),
-            loss="soft_l1",
-            max_nfev=20,
-        )
+        fit = least_squares(errors, start, args=(delay,), loss="soft_l1", max_nfev=20)
         fits.append((float(fit.cost), delay, fit.x))
-    _, delay, gains = min(fits, key=lambda f: f[0])
-    return track(delay, gains)
+        start = fit.x
+    _, delay, best = min(fits, key=lambda f: f[0])
+    scale = CAMERA_RANGE_SCALE if best[2] > 0.5 else 1.0
+    # Landmarks and odometry fix speed over range only: the motion shrinks with the ranges.
+    return Calibration(delay, float(best[0]) / scale, float(best[1]), float(best[2]), scale)
 
 
 def _successive(readings: Array, barcodes: Set[int]) -> tuple[Array, Array]:
@@ -295,7 +337,7 @@ def _prediction_errors(track: Track, before: Array, after: Array) -> Array:
     dy = start[:, 1] + before[:, 2] * np.sin(heading) - end[:, 1]
     bearing = after[:, 3] - np.arctan2(dy, dx) + end[:, 2]
     bearing = (bearing + np.pi) % (2 * np.pi) - np.pi
-    return np.concatenate([(after[:, 2] - np.hypot(dx, dy)) / 0.05, bearing / 0.01])
+    return np.concatenate([(after[:, 2] - np.hypot(dx, dy)) / 0.03, bearing / 0.01])
 
 
 def _states_at(track: Track, times: Array) -> Array:
@@ -377,7 +419,7 @@ def _write(
     landmarks: dict[int, Array],
     ends: Array,
     window: float,
-    noise: RangeBearingNoise,
+    noise: RangeBearingNoise | None,
 ) -> Imported:
     by_number = {robot.number: robot for robot in robots}
     robot_rows: list[dict[str, object]] = []
@@ -385,7 +427,8 @@ def _write(
     for frame, end in enumerate(ends.tolist()):
         for robot in robots:
             robot_rows.append(_robot_row(robot, frame, end, window, float(ends[0])))
-            seen = detect(robot, end, window, noise)
+            assumed = noise or (CALIBRATED_NOISE if robot.calibrated else RAW_NOISE)
+            seen = detect(robot, end, window, assumed)
             for index, barcode in enumerate(seen.barcodes.tolist()):
                 subject = subjects.get(barcode, -1)
                 truth = _subject_truth(subject, end, landmarks, by_number)
