@@ -1,8 +1,8 @@
 """Planar robots that pybullet moves: box bodies driven like unicycles, collisions on.
 
-pybullet is used as a function: poses in, poses out. Before every environment step each body is taken apart from the
-others (which empties the engine's contact cache) and set to the given pose, so that a step depends on nothing but its
-arguments. That is what makes episodes, saved states and worlds in other processes agree bit for bit.
+pybullet is used as a function: poses in, poses out. Before an environment step each body is set to the given pose; if
+the engine still caches contacts, it first takes the bodies apart, which empties the cache. So a step depends on nothing
+but its arguments. That is what makes episodes, saved states and worlds in other processes agree bit for bit.
 """
 
 from __future__ import annotations
@@ -13,8 +13,9 @@ import functools
 import os
 import sys
 import weakref
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from math import atan2, cos, sin
 from types import ModuleType
 from typing import Any, Protocol
 
@@ -121,11 +122,12 @@ class Engine:
         if self._client is None:
             self._client = connect()
             self._finalizer = weakref.finalize(self, _disconnect, self._client)
-            self.build(self._pybullet, self._client)
+            self.build(self.pybullet, self._client)
         return self._client
 
     @property
-    def _pybullet(self) -> ModuleType:
+    def pybullet(self) -> ModuleType:
+        """The module; not held, so that engines can be pickled."""
         return load_pybullet()
 
     def build(self, p: ModuleType, client: int) -> None:
@@ -163,6 +165,7 @@ class BoxDynamics(Engine):
         self._obstacle_sizes = np.array(obstacle_sizes, dtype=np.float64).reshape(-1, 2)
         self._step_seconds, self._updates, self._substeps = step_seconds, updates, substeps
         self._obstacles = np.zeros((0, 3))
+        self._cache_empty = False
 
     def build(self, p: ModuleType, client: int) -> None:
         """One body per robot, then one per obstacle: body ids are 0..n-1 and n..n+k-1."""
@@ -180,7 +183,9 @@ class BoxDynamics(Engine):
             half = [length / 2, width / 2, TALL_M / 2]
             shape = p.createCollisionShape(p.GEOM_BOX, halfExtents=half, physicsClientId=client)
             mass = 50.0 if body < n else 0.0
-            made = p.createMultiBody(mass, shape, -1, limbo(body), physicsClientId=client)
+            made = p.createMultiBody(
+                mass, shape, self.visual_shape(p, client, body), limbo(body), physicsClientId=client
+            )
             assert made == body
             if mass:
                 turning = mass * (length**2 + width**2) / 12
@@ -197,6 +202,10 @@ class BoxDynamics(Engine):
                 )
         self._place_obstacles(p, client)
 
+    def visual_shape(self, p: ModuleType, client: int, body: int) -> int:
+        """What pybullet's own renderers draw for a body: nothing."""
+        return -1
+
     def rest(self, planar: Array) -> BodyState:
         """Robots standing still at planar poses (n, 3)."""
         planar = wrapped(planar)
@@ -208,45 +217,50 @@ class BoxDynamics(Engine):
             raise ValueError(f"{len(planar)} obstacles given, built for {len(self._obstacle_sizes)}")
         self._obstacles = np.array(planar, dtype=np.float64).reshape(-1, 3)
         if self._client is not None:
-            self._place_obstacles(self._pybullet, self._client)
+            self._place_obstacles(self.pybullet, self._client)
 
     def advance(self, state: BodyState, commands: Array) -> tuple[BodyState, NDArray[np.bool_]]:
         """See `Dynamics.advance`."""
-        client, p = self.client, self._pybullet
+        client, p = self.client, self.pybullet
         set_velocity, get_pose = p.resetBaseVelocity, p.getBasePositionAndOrientation
         self._set_poses(p, client, state.planar)
         n = len(state.planar)
-        half_turn = commands[:, 1] * (0.5 * self._step_seconds / self._updates)
-        angular = [[0.0, 0.0, rate] for rate in commands[:, 1].tolist()]
-        linear = np.zeros((n, 3))
-        heading = state.planar[:, 2]
+        interval = self._step_seconds / self._updates
+        speed, rate = commands[:, 0].tolist(), commands[:, 1].tolist()
+        angular = [(0.0, 0.0, r) for r in rate]
+        heading = state.planar[:, 2].tolist()
         touched = np.zeros(n, dtype=bool)
         for _ in range(self._updates):
-            direction = heading + half_turn  # the chord of the arc
-            linear[:, 0] = commands[:, 0] * np.cos(direction)
-            linear[:, 1] = commands[:, 0] * np.sin(direction)
-            for body, v in enumerate(linear.tolist()):
-                set_velocity(body, v, angular[body], client)
+            for body in range(n):
+                chord = heading[body] + 0.5 * interval * rate[body]
+                set_velocity(body, (speed[body] * cos(chord), speed[body] * sin(chord), 0.0), angular[body], client)
             p.stepSimulation(client)
-            poses = [get_pose(body, client) for body in range(n)]
-            heading = np.array([2.0 * np.arctan2(q[2], q[3]) for _, q in poses])
-            for contact in p.getContactPoints(physicsClientId=client):
-                if contact[8] <= CONTACT_M:
-                    touched[[b for b in contact[1:3] if b < n]] = True
-        planar = wrapped(np.column_stack([np.array([position[:2] for position, _ in poses]).reshape(n, 2), heading]))
+            heading = [h + interval * r for h, r in zip(heading, rate, strict=True)]
+            contacts = p.getContactPoints(physicsClientId=client)
+            for contact in contacts:
+                for body in contact[1:3]:
+                    if body < n:  # a contact may have turned it
+                        heading[body] = _heading(get_pose(body, client)[1])
+                        touched[body] |= contact[8] <= CONTACT_M
+        self._cache_empty = not contacts
+        planar = np.empty((n, 3))
+        for body in range(n):
+            position, turn = get_pose(body, client)
+            planar[body] = position[0], position[1], _heading(turn)
+        planar = wrapped(planar)
         moved = wrapped(planar - state.planar) / self._step_seconds
         return frozen_state(planar, moved, state.inner), touched
 
     def _set_poses(self, p: ModuleType, client: int, planar: Array) -> None:
         """Set robots to planar poses (n, 3) with an empty contact cache."""
         set_pose = p.resetBasePositionAndOrientation
-        for body in range(len(planar)):
-            set_pose(body, limbo(body), (0.0, 0.0, 0.0, 1.0), client)
-        p.performCollisionDetection(client)
-        half = 0.5 * planar[:, 2]
-        rows = np.column_stack([planar[:, :2], np.sin(half), np.cos(half)]).tolist()
-        for body, (x, y, sine, cosine) in enumerate(rows):
-            set_pose(body, (x, y, 0.0), (0.0, 0.0, sine, cosine), client)
+        if not self._cache_empty:
+            for body in range(len(planar)):
+                set_pose(body, limbo(body), (0.0, 0.0, 0.0, 1.0), client)
+            p.performCollisionDetection(client)
+            self._cache_empty = True
+        for body, (x, y, heading) in enumerate(planar.tolist()):
+            set_pose(body, (x, y, 0.0), (0.0, 0.0, sin(0.5 * heading), cos(0.5 * heading)), client)
 
     def _place_obstacles(self, p: ModuleType, client: int) -> None:
         n = len(self._robot_sizes)
@@ -270,6 +284,11 @@ def wrapped(planar: Array) -> Array:
     out = np.array(planar, dtype=np.float64)
     out[:, 2] -= 2 * np.pi * np.round(out[:, 2] / (2 * np.pi))
     return out
+
+
+def _heading(turn: Sequence[float]) -> float:
+    """Heading in rad of a quaternion (x, y, z, w) that turns about z."""
+    return 2.0 * atan2(turn[2], turn[3])
 
 
 def limbo(body: int) -> tuple[float, float, float]:

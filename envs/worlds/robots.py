@@ -298,6 +298,16 @@ class RobotWorld:
             raise ValueError(f"this state is not one of {self._key()}, but of {of}")
         self._take(saved.scene, saved.state)
 
+    def obstacle_sizes(self) -> Array:
+        """Length and width (k, 2) m of as many obstacles as a scene can have."""
+        name = "container" if self.params.obstacles == "scenery" else self.params.obstacles
+        return np.tile(self._sizes[self._index(name), :2], (self.params.n_obstacles[1], 1))
+
+    def use_dynamics(self, dynamics: Dynamics) -> None:
+        """Move the robots by other dynamics from the next reset on."""
+        self.close()
+        self._dynamics, self._scene, self._state = dynamics, None, None
+
     # ------------------------------------------------------------------ generation
 
     def _generate(self, rng: np.random.Generator) -> tuple[Scene, Array, Array]:
@@ -311,7 +321,14 @@ class RobotWorld:
         obstacles = self._place_obstacles(rng, radius, planar)
         backdrop_poses, backdrop_model, backdrop_tints = self._backdrop(rng)
         routes = draw_routes(
-            rng, team[:, :2], radius, p.moving_share, p.team_speed_mps, p.max_turn_radps, 1.3 * p.separation_m
+            rng,
+            team[:, :2],
+            radius,
+            moving_share=p.moving_share,
+            speed_mps=p.team_speed_mps,
+            max_turn=p.max_turn_radps,
+            keep_away_m=1.3 * p.separation_m,
+            arrived_m=0.6 * p.scale,
         )
         model, tints = self._looks(rng)
         obstacle_model = self._index(self._obstacle_model(rng))
@@ -432,9 +449,13 @@ class RobotWorld:
     def _team_commands(self, scene: Scene, state: State) -> tuple[NDArray[np.int64], Array]:
         grounded = self.n_robots - self.n_flyers
         planar = state.bodies.planar
-        target = advance_waypoints(scene.routes, state.target, planar[grounded:])
+        routes, team = scene.routes, planar[grounded:]
+        target = advance_waypoints(routes.waypoints, routes.speed, state.target, team, routes.arrived_m)
         others = np.vstack([planar[:grounded, :2], scene.obstacles[:, :2]])
-        return target, team_commands(scene.routes, target, planar[grounded:], others)
+        commands = team_commands(
+            routes.waypoints, routes.speed, routes.max_turn, routes.keep_away_m, target, team, others
+        )
+        return target, commands
 
     def _fly(self, flight: Array, controls: Array) -> Array:
         return flight
@@ -463,12 +484,11 @@ class RobotWorld:
         self._sizes = np.stack([model.size for model in self.models])
         self._centres = np.stack([model.centre for model in self.models])
         self._object_classes = np.array([model.object_class for model in self.models], dtype=np.int64)
-        obstacle = "container" if p.obstacles == "scenery" else p.obstacles
         robots = np.tile(self._sizes[self._index("husky"), :2], (grounded, 1))
         unique = round(p.unique_share * p.n_team)
         first = self.n_robots - self.n_flyers
         robots[first : first + unique] = self._sizes[[self._index(name) for name in UNIQUE_MODELS], :2].max(0)
-        obstacles = np.tile(self._sizes[self._index(obstacle), :2], (p.n_obstacles[1], 1))
+        obstacles = self.obstacle_sizes()
         if p.dynamics == "wheels":
             return WheelDynamics(grounded, obstacles, scale=p.scale, step_seconds=p.step_seconds)
         return BoxDynamics(robots, obstacles, step_seconds=p.step_seconds)

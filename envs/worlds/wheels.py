@@ -30,7 +30,8 @@ def husky_urdf() -> str:
 class WheelDynamics(Engine):
     """Stock Huskies whose wheel motors follow the command; they accelerate, slip and push.
 
-    `BodyState.inner` (n, 21): base position (3) and quaternion (4), linear (3) and angular (3) velocity, wheel angles (4) and rates (4).
+    `BodyState.inner` (n, 21): base position (3) and quaternion (4), linear (3) and angular (3) velocity, wheel angles
+    (4) and rates (4).
     """
 
     def __init__(
@@ -89,11 +90,11 @@ class WheelDynamics(Engine):
             raise ValueError(f"{len(planar)} obstacles given, built for {len(self._obstacle_sizes)}")
         self._obstacles = np.array(planar, dtype=np.float64).reshape(-1, 3)
         if self._client is not None:
-            self._place_obstacles(self._pybullet, self._client)
+            self._place_obstacles(self.pybullet, self._client)
 
     def advance(self, state: BodyState, commands: Array) -> tuple[BodyState, NDArray[np.bool_]]:
         """See `Dynamics.advance`."""
-        client, p = self.client, self._pybullet
+        client, p = self.client, self.pybullet
         n, joints = self._n, self._joints
         self._set(p, client, state.inner)
         side = np.where(LEFT, -0.5, 0.5) * TRACK_M * SLIP
