@@ -5,7 +5,10 @@ A step scores the claims about the observation they answer, then moves the world
 
 from __future__ import annotations
 
+import copy
+import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -18,10 +21,68 @@ from .camera.raster import Frame as CameraFrame
 from .camera.raster import Rasterizer, intrinsics_from_fov
 from .claims import Claims, action_space, decode
 from .scoring import LocalizationReward, Reward, StepScore, Truth, score, tight_boxes
+from .seeding import EpisodeSeeds, Seed
 from .sensing import MAX_DEPTH_M, PoseNoise, permuted_instances, up_in_camera
 from .worlds.world import Snapshot, World
 
 SENSORS = ("image", "depth", "instances")
+
+
+@dataclass(frozen=True, eq=False)
+class Instant:
+    """One instant of the world: what is there, what the cameras see, what is true."""
+
+    snapshot: Snapshot
+    frames: tuple[CameraFrame, ...]
+    truth: Truth
+
+
+@dataclass(frozen=True, eq=False)
+class Answered:
+    """Claims of all robots, the instant they are about, and their scores."""
+
+    instant: Instant
+    claims: tuple[Claims, ...]
+    score: StepScore
+
+
+@dataclass(eq=False)
+class _Episode:
+    """Everything of the environment itself that changes; a deep copy of it is its saved state.
+
+    `sums` and `totals` (N, N_SUMS) are those of the last step and of the episode, see `_sums`.
+    """
+
+    noise_rng: np.random.Generator
+    id_rng: np.random.Generator
+    steps: int
+    claims: list[Claims]
+    score: StepScore | None
+    sums: NDArray[np.float64]
+    totals: NDArray[np.float64]
+    now: Instant
+    before: Instant | None
+    marked: tuple[Any, Any] | None = None
+
+    def mark(self) -> None:
+        """Remember the random numbers with which the observations are about to be made."""
+        self.marked = self.noise_rng.bit_generator.state, self.id_rng.bit_generator.state
+
+    def rewind(self) -> None:
+        """Go back to the mark, so that the same observations can be made again."""
+        assert self.marked is not None
+        self.noise_rng.bit_generator.state, self.id_rng.bit_generator.state = self.marked
+
+
+@dataclass(frozen=True, eq=False)
+class SavedState:
+    """A state of `CollaborativeEnv.save_state`; it can be pickled. Its contents are no interface."""
+
+    name: str
+    world: Any
+    episode: _Episode
+    agents: tuple[str, ...]
+    seeds: EpisodeSeeds
 
 
 class CollaborativeEnv(ParallelEnv, EzPickle):
@@ -59,7 +120,7 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         min_pixels: int = 60,
         sensors: Sequence[str] = ("image",),
         messages: bool = False,
-        seed: int | None = None,
+        seed: Seed | None = None,
         render_mode: Literal["rgb_array", "human"] | None = None,
     ) -> None:
         EzPickle.__init__(
@@ -85,8 +146,10 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
             ("max_cycles", max_cycles, 1),
             ("min_pixels", min_pixels, 1),
         ):
-            if int(value) != value or value < least:
+            if not isinstance(value, (int, np.integer)) or value < least:
                 raise ValueError(f"{label} must be a whole number >= {least}, got {value}")
+        if isinstance(sensors, str):
+            raise ValueError(f"sensors must be a sequence of names, got the string {sensors!r}")
         unknown = [s for s in sensors if s not in SENSORS]
         if unknown:
             raise ValueError(f"unknown sensor {unknown[0]!r}; there are {', '.join(SENSORS)}")
@@ -116,13 +179,10 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         self.intrinsics = np.stack(
             [intrinsics_from_fov(self.width, self.height, float(f)) for f in self.world.horizontal_fov_rad]
         )
-        self._entropy = np.random.SeedSequence(seed)
+        self._seeds = EpisodeSeeds.start(seed)
         self._rasterizer: Rasterizer | None = None
         self._window: Any = None
-        self._snapshot: Snapshot | None = None
-        self._frames: list[CameraFrame] = []
-        self._claims: list[Claims] = []
-        self._last_score: StepScore | None = None
+        self._episode: _Episode | None = None
         space = action_space(self.world.control_size, self.max_detections, n - 1, self.width, self.height)
         self.action_spaces = dict.fromkeys(self.possible_agents, space)
         observation = self._make_observation_space()
@@ -170,31 +230,47 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
     # The episode
 
     def reset(
-        self, seed: int | Sequence[int] | np.random.SeedSequence | None = None, options: dict[str, Any] | None = None
+        self, seed: Seed | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Start an episode.
 
         Args:
-            seed: the same seed gives the same episode, bit for bit; None goes on with the next of the present seed.
-            options: none are known.
+            seed: a number, a sequence of numbers or a SeedSequence. The same seed gives the same series of episodes,
+                bit for bit; None goes on with the next episode of the present series.
+            options: `{"state": saved}` goes on from a state of `save_state` instead, see `restore_state`. Others are
+                ignored with a warning.
 
         Raises:
-            ValueError: an unknown option.
+            ValueError: not a seed; both a seed and a state.
         """
+        options = dict(options or {})
+        saved = options.pop("state", None)
         if options:
-            raise ValueError(f"unknown reset option {next(iter(options))!r}")
+            warnings.warn(f"unknown reset option {next(iter(options))!r} is ignored; there is 'state'", stacklevel=2)
+        if saved is not None:
+            if seed is not None:
+                raise ValueError(f"a saved state goes on with its own random numbers: seed must be None, got {seed!r}")
+            return self.restore_state(saved)
         if seed is not None:
-            self._entropy = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
-        (episode,) = self._entropy.spawn(1)
-        world_rng, self._noise_rng, self._id_rng = (np.random.default_rng(s) for s in episode.spawn(3))
+            self._seeds = EpisodeSeeds.start(seed)
+        episode_seed, self._seeds = self._seeds.next()
+        world_rng, noise_rng, id_rng = (np.random.default_rng(s) for s in episode_seed.spawn(3))
         self.world.reset(world_rng)
         self.agents = list(self.possible_agents)
-        self._steps = 0
-        self._claims = [Claims.empty(self.max_detections, len(self.agents) - 1) for _ in self.possible_agents]
-        self._last_score = None
-        self._totals = np.zeros((len(self.agents), N_SUMS))
-        self._look(previous=None)
-        return self._observe(), self._infos(np.zeros_like(self._totals))
+        snapshot = self._take_snapshot()
+        n = len(self.agents)
+        self._episode = _Episode(
+            noise_rng=noise_rng,
+            id_rng=id_rng,
+            steps=0,
+            claims=[Claims.empty(self.max_detections, n - 1) for _ in self.agents],
+            score=None,
+            sums=np.zeros((n, N_SUMS)),
+            totals=np.zeros((n, N_SUMS)),
+            now=self._look(snapshot),
+            before=None,
+        )
+        return self._observe(self._episode), self._infos(self._episode)
 
     def step(
         self, actions: dict[str, Any]
@@ -202,32 +278,33 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         """Score the claims, move the world, observe.
 
         Raises:
-            ValueError: an agent's action is missing or does not fit its space; the message names agent and leaf.
+            ValueError: an agent's action is missing or does not fit its space; the message names agent and leaf, and
+                nothing has moved.
             RuntimeError: the episode is over or was never begun.
         """
-        if self._snapshot is None:
-            raise RuntimeError("reset() must be called before step()")
-        if not self.agents:
+        episode = self._running("step()")
+        agents = self.agents
+        if not agents:
             raise RuntimeError("the episode is over: call reset()")
-        missing = [a for a in self.agents if a not in actions]
+        missing = [a for a in agents if a not in actions]
         if missing:
             raise ValueError(f"{missing[0]}: no action given")
-        decoded = [decode(a, actions[a], self.action_spaces[a]) for a in self.agents]
-        self._claims = [claims for _, claims in decoded]
-        result = score(self._claims, self._truth)
-        self._last_score = result
-        reward = float(self.reward(result))
-        before = self._snapshot
+        unknown = [a for a in actions if a not in agents]
+        if unknown:
+            raise ValueError(f"{unknown[0]}: there is no such agent; there are {', '.join(agents)}")
+        decoded = [decode(a, actions[a], self.action_spaces[a]) for a in agents]
+        episode.claims = [claims for _, claims in decoded]
+        episode.score = score(episode.claims, episode.now.truth)
+        episode.sums = _sums(episode.score)
+        episode.totals = episode.totals + episode.sums
+        reward = float(self.reward(episode.score))
         self.world.step(np.stack([control for control, _ in decoded]))
-        self._steps += 1
-        self._look(previous=before)
-        agents = self.agents
-        crashed = bool(self.world.ends_on_collision and self._snapshot.collided.any())
-        over = self._steps >= self.max_cycles
-        observations = self._observe()
-        sums = _sums(result)
-        self._totals += sums
-        infos = self._infos(sums)
+        episode.steps += 1
+        snapshot = self._take_snapshot()
+        episode.before, episode.now = episode.now, self._look(snapshot)
+        crashed = bool(self.world.ends_on_collision and snapshot.collided.any())
+        over = episode.steps >= self.max_cycles
+        observations, infos = self._observe(episode), self._infos(episode)
         if crashed or over:
             self.agents = []
         if self.render_mode == "human":
@@ -240,17 +317,58 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
             infos,
         )
 
-    def _look(self, previous: Snapshot | None) -> None:
-        """Render the present instant and note what is true."""
+    def save_state(self) -> SavedState:
+        """A copy of everything that changes; `restore_state` goes on from it bit-identically, any number of times.
+
+        Raises:
+            RuntimeError: before the first reset.
+            NotImplementedError: this world cannot save its state.
+        """
+        episode = self._running("save_state()")
+        save = getattr(self.world, "save_state", None)
+        if save is None:
+            raise NotImplementedError(f"{type(self.world).__name__} has no save_state()")
+        return SavedState(self.name, save(), copy.deepcopy(episode), tuple(self.agents), self._seeds)
+
+    def restore_state(self, saved: SavedState) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Go back to a state of `save_state`, of this environment or of one made with the same arguments.
+
+        Returns:
+            Observations and infos as they were returned then, for all robots even when the episode is over.
+
+        Raises:
+            ValueError: not a saved state of this scene.
+        """
+        if not isinstance(saved, SavedState) or saved.name != self.name:
+            what = repr(saved.name) if isinstance(saved, SavedState) else type(saved).__name__
+            raise ValueError(f"a state of {self.name!r} is needed, from its save_state(); got {what}")
+        self.world.restore_state(saved.world)  # type: ignore[attr-defined]
+        self._episode = copy.deepcopy(saved.episode)
+        self._episode.rewind()
+        self.agents, self._seeds = list(saved.agents), saved.seeds
+        return self._observe(self._episode), self._infos(self._episode)
+
+    def _running(self, caller: str) -> _Episode:
+        if self._episode is None:
+            raise RuntimeError(f"reset() must be called before {caller}")
+        return self._episode
+
+    def _take_snapshot(self) -> Snapshot:
+        snapshot = self.world.snapshot()
+        if len(snapshot.identity) > self.world.max_objects:
+            raise RuntimeError(
+                f"{self.name}: {len(snapshot.identity)} objects, max_objects is {self.world.max_objects}"
+            )
+        return snapshot
+
+    def _look(self, snapshot: Snapshot) -> Instant:
+        """Render an instant and note what is true."""
         if self._rasterizer is None:
             self._rasterizer = Rasterizer(self.world.meshes, self.width, self.height)
-        snapshot = self.world.snapshot()
         n, m = self.world.n_robots, len(snapshot.identity)
-        self._previous = snapshot if previous is None else previous
-        self._snapshot = snapshot
-        self._frames = [self._rasterizer.render(snapshot, i, self.intrinsics[i]) for i in range(n)]
-        tight = [tight_boxes(frame.instances, m) for frame in self._frames]
-        self._truth = Truth(
+        frames = tuple(self._rasterizer.render(snapshot, i, self.intrinsics[i]) for i in range(n))
+        tight = [tight_boxes(frame.instances, m) for frame in frames]
+        truth = Truth(
             identity=snapshot.identity,
             object_class=snapshot.object_class,
             positions=snapshot.positions,
@@ -259,36 +377,39 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
             pixels=np.stack([pixels for _, pixels in tight]),
             min_pixels=self.min_pixels,
         )
+        return Instant(snapshot, frames, truth)
 
-    def _observe(self) -> dict[str, Any]:
-        assert self._snapshot is not None
-        return {agent: self._observe_one(i, self._snapshot) for i, agent in enumerate(self.possible_agents)}
+    def _observe(self, episode: _Episode) -> dict[str, Any]:
+        episode.mark()
+        return {agent: self._observe_one(i, episode) for i, agent in enumerate(self.possible_agents)}
 
-    def _observe_one(self, i: int, snapshot: Snapshot) -> dict[str, NDArray[Any]]:
-        frame, T = self._frames[i], snapshot.T_world_camera[i]
+    def _observe_one(self, i: int, episode: _Episode) -> dict[str, NDArray[Any]]:
+        snapshot, frame = episode.now.snapshot, episode.now.frames[i]
+        T = snapshot.T_world_camera[i]
+        last = T if episode.before is None else episode.before.snapshot.T_world_camera[i]
         up = up_in_camera(T)
         out: dict[str, NDArray[Any]] = {}
         if "image" in self.sensors:
             out["image"] = frame.rgb.copy()
         out["intrinsics"] = self.intrinsics[i].astype(np.float32)
-        out["pose"] = self.pose_noise.pose(T, self._noise_rng).astype(np.float32)
+        out["pose"] = self.pose_noise.pose(T, episode.noise_rng).astype(np.float32)
         out["pose_covariance"] = self.pose_noise.covariance(up).astype(np.float32)
         out["up"] = up.astype(np.float32)
-        last = self._previous.T_world_camera[i]
-        out["odometry"] = self.pose_noise.odometry(last, T, self._noise_rng).astype(np.float32)
+        out["odometry"] = self.pose_noise.odometry(last, T, episode.noise_rng).astype(np.float32)
         out["state"] = snapshot.robot_state[i].astype(np.float32)
         if "depth" in self.sensors:
             out["depth"] = np.minimum(frame.depth, np.float32(MAX_DEPTH_M))
         if "instances" in self.sensors:
             out["instances"], out["instance_classes"] = permuted_instances(
-                frame.instances, snapshot.object_class, self.world.max_objects, self._id_rng
+                frame.instances, snapshot.object_class, self.world.max_objects, episode.id_rng
             )
         if self.messages:
-            out |= self._messages(i)
+            out |= self._messages(i, episode.claims)
         return out
 
-    def _messages(self, i: int) -> dict[str, NDArray[Any]]:
-        partners = [claims for j, claims in enumerate(self._claims) if j != i]
+    @staticmethod
+    def _messages(i: int, claims: Sequence[Claims]) -> dict[str, NDArray[Any]]:
+        partners = [c for j, c in enumerate(claims) if j != i]
         return {
             "message_boxes": np.stack([c.boxes for c in partners]).astype(np.float32),
             "message_positions": np.stack([c.positions for c in partners]).astype(np.float32),
@@ -297,13 +418,17 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
             "message_match_scores": np.stack([c.match_scores for c in partners]).astype(np.float32),
         }
 
-    def _infos(self, sums: NDArray[np.float64]) -> dict[str, dict[str, float]]:
-        """Figures of the last step's claims, and `episode_*` over the episode so far; undefined errors are NaN."""
-        collided = self.snapshot().collided
+    def _infos(self, episode: _Episode) -> dict[str, dict[str, float]]:
+        """Figures of the last step's claims, and `episode_*` over the episode so far.
+
+        Ratios and means of nothing are 0: counts tell them from others. (NaN is not equal to itself: it would break
+        comparisons and poison the means that trainers log.)
+        """
+        collided = episode.now.snapshot.collided
         return {
             agent: {
-                **_figures(sums[i], ""),
-                **_figures(self._totals[i], "episode_"),
+                **_figures(episode.sums[i], ""),
+                **_figures(episode.totals[i], "episode_"),
                 "collided": float(collided[i]),
             }
             for i, agent in enumerate(self.possible_agents)
@@ -317,23 +442,26 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         Raises:
             RuntimeError: before the first reset.
         """
-        if self._snapshot is None:
-            raise RuntimeError("reset() must be called before ground_truth()")
-        return self._truth
+        return self._running("ground_truth()").now.truth
 
     def last_score(self) -> StepScore | None:
         """Scores of the claims of the last step; None before it."""
-        return self._last_score
+        return None if self._episode is None else self._episode.score
+
+    def answered(self) -> Answered | None:
+        """The last step's claims with the instant they were about; None before the first step."""
+        episode = self._episode
+        if episode is None or episode.before is None or episode.score is None:
+            return None
+        return Answered(episode.before, tuple(episode.claims), episode.score)
 
     def snapshot(self) -> Snapshot:
-        """The world at the instant of the last observation."""
-        if self._snapshot is None:
-            raise RuntimeError("reset() must be called before snapshot()")
-        return self._snapshot
+        """The world at the instant of the last observation. Raises RuntimeError before the first reset."""
+        return self._running("snapshot()").now.snapshot
 
     def camera_frames(self) -> list[CameraFrame]:
-        """Rendered frames of the last observation, one per robot, instances by object index."""
-        return self._frames
+        """Rendered frames of the last observation, one per robot, instances by object index. Raises like `snapshot`."""
+        return list(self._running("camera_frames()").now.frames)
 
     def _state_size(self) -> int:
         return 13 * self.world.max_objects + self.world.n_robots * (16 + self.world.state_size)
@@ -403,6 +531,6 @@ def _figures(sums: NDArray[np.float64], prefix: str) -> dict[str, float]:
         f"{prefix}recall": float(correct / common) if common else 0.0,
         f"{prefix}scene_recall": float(correct / visible) if visible else 0.0,
         f"{prefix}n_localized": float(localized),
-        f"{prefix}displacement_single_m": float(single / localized) if localized else float("nan"),
-        f"{prefix}displacement_fused_m": float(fused / localized) if localized else float("nan"),
+        f"{prefix}displacement_single_m": float(single / localized) if localized else 0.0,
+        f"{prefix}displacement_fused_m": float(fused / localized) if localized else 0.0,
     }
