@@ -13,7 +13,7 @@ from .world import Array
 
 WHEEL_RADIUS_M = 0.17775
 TRACK_M = 0.5708
-SLIP = 3.4
+SLIP = 2.8
 """Skid steering turns slower than its wheels say: measured yaw rate at equal and opposite wheel speeds."""
 MOTOR_NM = 40.0
 WHEELS = ("front_left_wheel", "front_right_wheel", "rear_left_wheel", "rear_right_wheel")
