@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from typing import Any
 
 from pettingzoo import AECEnv
@@ -70,7 +71,7 @@ def parallel_env(
     """A scene as a PettingZoo ParallelEnv.
 
     Args:
-        scene: a name in SCENES.
+        scene: a name in SCENES, or `package.module:World`, a callable that takes (n_robots) or nothing.
         n_robots: robots with cameras; None = the scene's default.
         preset: difficulty, `easy`, `paper` or `hard`; None = `paper`.
         params: of the world's generator, instead of a preset.
@@ -79,8 +80,10 @@ def parallel_env(
     Raises:
         ValueError: an unknown scene, or what the world or the environment refuses.
     """
+    if scene not in SCENES and ":" in scene:
+        return _own_scene(scene, n_robots, preset, params, options)
     if scene not in SCENES:
-        raise ValueError(f"no scene is called {scene!r}; there are {', '.join(SCENES)}")
+        raise ValueError(f"no scene is called {scene!r}; there are {', '.join(SCENES)}, or package.module:World")
     spec = SCENES[scene]
     if params is not None and preset is not None:
         raise ValueError(f"give a preset or params, not both: preset={preset!r}")
@@ -92,6 +95,21 @@ def parallel_env(
         "reward": spec.reward,
     }
     return CollaborativeEnv(make_world, **(defaults | options))
+
+
+def _own_scene(
+    path: str, n_robots: int | None, preset: str | None, params: Any, options: dict[str, Any]
+) -> CollaborativeEnv:
+    """A scene from anywhere: the world's class (or any callable that makes one) by its path."""
+    module_name, _, attribute = path.partition(":")
+    try:
+        world = getattr(import_module(module_name), attribute)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"no World at {path!r}: {error}") from error
+    if preset is not None:
+        raise ValueError(f"{path!r} has no presets, got preset={preset!r}; give params")
+    arguments = [a for a in (n_robots, params) if a is not None]
+    return CollaborativeEnv(partial(world, *arguments), **({"name": attribute} | options))
 
 
 def aec_env(scene: str, **options: Any) -> AECEnv:

@@ -17,7 +17,7 @@ SCENE_NAMES = ("connected_driving", "multi_robot", "aerial_ground", "target_loca
 
 
 def plan(targets: Sequence[str], settings: Settings) -> list[Unit]:
-    """Work units of the targets: names of scenes and dataset folders.
+    """Work units of the targets: names of scenes, `package.module:World`, dataset folders.
 
     Raises:
         ValueError: a target that is neither.
@@ -25,7 +25,7 @@ def plan(targets: Sequence[str], settings: Settings) -> list[Unit]:
     """
     units: list[Unit] = []
     for target in targets:
-        if target in SCENE_NAMES:
+        if target in SCENE_NAMES or (":" in target and not Path(target).exists()):
             require("envs")
             units += scene_units(target, settings)
         elif Path(target).is_dir():

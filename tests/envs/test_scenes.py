@@ -1,0 +1,49 @@
+"""Scenes by name, by path, and in PettingZoo's registry."""
+
+import pytest
+from covis.envs.scenes import SCENES, parallel_env
+
+
+def test_unknown_scene_lists_the_known():
+    with pytest.raises(ValueError, match=r"no scene is called 'mars'; there are connected_driving, .*World"):
+        parallel_env("mars")
+
+
+def test_unknown_preset_is_named():
+    with pytest.raises(ValueError, match="impossible"):
+        parallel_env("multi_robot", preset="impossible")
+
+
+def test_preset_or_params():
+    params = SCENES["multi_robot"].preset("easy")
+    with pytest.raises(ValueError, match="a preset or params, not both"):
+        parallel_env("multi_robot", preset="easy", params=params)
+
+
+def test_a_scene_of_ones_own_by_path():
+    env = parallel_env("box_world:BoxWorld", n_robots=3, width=32, height=24)
+    observations, _ = env.reset(seed=0)
+    assert sorted(observations) == ["robot_0", "robot_1", "robot_2"]
+    env.close()
+
+
+@pytest.mark.parametrize("path", ["no.such:World", "box_world:Nothing"])
+def test_a_path_that_leads_nowhere(path):
+    with pytest.raises(ValueError, match=f"no World at '{path}'"):
+        parallel_env(path)
+
+
+def test_every_scene_is_in_the_registry():
+    pettingzoo = pytest.importorskip("pettingzoo")
+    if not hasattr(pettingzoo, "parallel_registry"):
+        pytest.skip("this PettingZoo has no registry")
+    from importlib import import_module
+
+    for name, scene in SCENES.items():
+        import_module(f"covis.envs.{name}_v{scene.version}")
+        assert f"covis/{name}-v{scene.version}" in pettingzoo.parallel_registry
+        assert f"covis/{name}-v{scene.version}" in pettingzoo.aec_registry
+    env = pettingzoo.make("parallel", "covis/multi_robot-v0") if hasattr(pettingzoo, "make") else None
+    if env is not None:
+        assert env.unwrapped.name == "multi_robot_v0"
+        env.close()
