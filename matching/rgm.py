@@ -11,8 +11,8 @@ Where the text does not determine a method that works, this file chooses, and sa
   ways seen from above (needs `up` in both graphs).
 * Terms of Eq. (15) grow like m, m^2 and m^3; `scaling="mean"` gives all of them the size of the count penalty, and
   ||X||^2 is m^2 (`count_penalty`): see `covis.matching.objective.coefficients`. `scaling="sum"` is as printed.
-* (V + U) adds m^2 to squared probabilities: each is divided by its own unit, by default its median in the pair, so
-  that lambda_1 weighs a relative uncertainty. Units of 1 are as printed.
+* (V + U) adds m^2 to squared probabilities: each is divided by its own unit, by default twice its median in the pair,
+  so that V + U is 1 for a typical candidate and lambda_1 weighs a relative uncertainty. Units of 1 are as printed.
 * gamma and sigma stand for seven different widths; each is a parameter here, with its unit.
 * exp() of Eq. (16) overflows: the chain works with log P.
 * Eq. (18) is normalised over the objects that can be added.
@@ -39,14 +39,13 @@ from .objective import (
     State,
     Terms,
     add,
+    best_exchange,
+    best_reassignment,
     coefficients,
-    copy_state,
     empty_state,
     load_match,
     remove,
     value,
-    value_after,
-    value_swapped,
 )
 from .pose import Array, RelativePose
 from .rrwm import reweighted_random_walk
@@ -185,8 +184,8 @@ def rgm(
         distance_width_m2, distance_width_factor, angle_width, attribute_uncertainty_width,
             distance_uncertainty_width_m2, angle_uncertainty_width_m2, neighbours, nine_terms, reject_mirrored: see
             `Similarity`.
-        attribute_unit: unit of v in the uncertainty regulariser, probability^2. None: its median in the pair.
-        position_unit_m2: unit of u there, m^2. None: its median in the pair. Give 1 for both to follow the text.
+        attribute_unit: unit of v in the uncertainty regulariser, probability^2. None: twice the median of V.
+        position_unit_m2: unit of u there, m^2. None: twice the median of U. Give 1 for both to follow the text.
         workers: processes among which the proposals are divided (section 4.2).
 
     Returns:
@@ -272,16 +271,18 @@ def build(
     neighbours = len(source) * len(target) if similarity.neighbours is None else similarity.neighbours
     if neighbours < 1:
         raise ValueError(f"neighbours must be at least 1, got {neighbours}")
-    attribute_unit, position_unit_m2 = _or(attribute_unit, scale_V), _or(position_unit_m2, scale_U)
+    attribute_unit, position_unit_m2 = _or(attribute_unit, 2 * scale_V), _or(position_unit_m2, 2 * scale_U)
+    pair = pair_affinity(source_distance, target_distance, width)
+    pair *= w_d[:, :, None, None]
+    pair *= w_d[None, None]
     mirrored = similarity.reject_mirrored
     terms = Terms(
         attribute=attribute_similarity(source.attributes, target.attributes) * w_a,
-        source_distance=source_distance,
-        target_distance=target_distance,
-        distance_width_m2=float(width),
-        distance_weight=w_d,
+        pair=pair,
         source_cosine=c,
         target_cosine=d,
+        source_apex=np.ascontiguousarray(c.transpose(1, 2, 0)),
+        target_apex=np.ascontiguousarray(d.transpose(1, 2, 0)),
         source_side=triangle_sides(source.positions, source.up if mirrored else None),
         target_side=triangle_sides(target.positions, target.up if mirrored else None),
         radius=triangle_radius(c, d, neighbours, similarity.nine_terms),
@@ -303,9 +304,7 @@ def build(
 def support(terms: Terms) -> Array:
     """(n, n') how well candidate matches agree with each other in attributes and distances: a random walk's visits."""
     n, m = terms.attribute.shape
-    affinity = pair_affinity(terms.source_distance, terms.target_distance, terms.distance_width_m2)
-    affinity *= terms.distance_weight[:, :, None, None] * terms.distance_weight[None, None]
-    affinity = affinity.reshape(n * m, n * m)
+    affinity = terms.pair.reshape(n * m, n * m).copy()
     affinity.flat[:: n * m + 1] = terms.attribute.ravel()
     return reweighted_random_walk(affinity, n, m, iterations=30)
 
@@ -348,7 +347,7 @@ def _solve_one(problem: Problem, annealing: Annealing, rng: np.random.Generator)
         problem.terms,
         problem.table,
         problem.table_pi,
-        np.argsort(-problem.support.ravel(), kind="stable"),
+        candidate_order(problem),
         problem.proposal_weight,
         initial_active(problem.support),
         temperatures,
@@ -357,6 +356,22 @@ def _solve_one(problem: Problem, annealing: Annealing, rng: np.random.Generator)
         rng.random((len(temperatures), 3)),
     )
     return match, float(log_p)
+
+
+def candidate_order(problem: Problem) -> NDArray[np.int64]:
+    """Candidates i * n' + i' in the order in which `assign` considers them.
+
+    By falling support, but first the matching that local search finds with as many objects active as can be matched:
+    the assignment of a subset is then mostly a part of it, and little is left to search.
+    """
+    m = problem.support.shape[1]
+    order = np.argsort(-problem.support.ravel(), kind="stable")
+    state = empty_state(*problem.support.shape)
+    assign(problem.terms, problem.table_pi, state, initial_active(problem.support), order)
+    rows = np.flatnonzero(state.match >= 0)
+    first = rows * m + state.match[rows]
+    first = first[np.argsort(-problem.support.ravel()[first], kind="stable")]
+    return np.concatenate([first, order[~np.isin(order, first)]])
 
 
 def initial_active(support: Array) -> NDArray[np.bool_]:
@@ -385,12 +400,11 @@ def run_chain(
     `order` lists the candidate matches i * n' + i' by falling support; `draws` (proposals, 3) are uniform in [0, 1).
     """
     n, m = terms.attribute.shape
-    state, best = empty_state(n, m), empty_state(n, m)
+    state = empty_state(n, m)
     active = active.copy()
     assign(terms, table_pi, state, active, order)
     log_p = value(state.sums, state.size[0], table)
-    copy_state(state, best)
-    best_log_p = log_p
+    best, best_log_p = state.match.copy(), log_p
     # pi(y) is a function of y: sets seen before are looked up.
     seen_key = np.zeros(4096, dtype=np.uint64)
     seen_value = np.full(4096, np.nan)
@@ -411,7 +425,7 @@ def run_chain(
                     seen_key[slot], seen_value[slot] = key, log_p_new
                     if log_p_new > best_log_p:
                         best_log_p = log_p_new
-                        copy_state(state, best)
+                        best[:] = state.match
             change = log_p_new - log_p
             if metropolis:
                 accepted = np.log(draws[step, 2]) < change / temperatures[step] + log_ratio
@@ -422,7 +436,7 @@ def run_chain(
             else:
                 active[i] = not active[i]
         visited[step] = set_key(active)
-    return best.match, best_log_p, visited
+    return best, best_log_p, visited
 
 
 @njit(cache=True)
@@ -472,7 +486,7 @@ def propose(active: NDArray[np.bool_], weight: Array, add_probability: float, dr
 
 @njit(cache=True)
 def assign(terms: Terms, table_pi: Array, state: State, active: NDArray[np.bool_], order: NDArray[np.int64]) -> None:
-    """pi(y), Eq. (17): put into `state` a matching of all active objects, at most n' of them.
+    """pi(y), Eq. (17): change `state` to a matching of all active objects, at most n' of them.
 
     Greedy by support, then the best reassignment or exchange until none raises the sums of Eq. (12).
     """
@@ -491,34 +505,21 @@ def assign(terms: Terms, table_pi: Array, state: State, active: NDArray[np.bool_
     load_match(terms, state, match)
     current = value(state.sums, state.size[0], table_pi)
     for _ in range(10 * n):
-        best, first, second = current + 1e-9, -1, -1
-        for i in range(n):
-            if state.match[i] < 0:
-                continue
-            for ii in range(m):
-                if state.holder[ii] < 0:
-                    after = value_after(terms, state, table_pi, i, ii)
-                    if after > best:
-                        best, first, second = after, i, ii
-            for j in range(i):
-                if state.match[j] >= 0:
-                    after = value_swapped(terms, state, table_pi, i, j)
-                    if after > best:
-                        best, first, second = after, i, m + j
-        if first < 0:
+        moved, i, ii = best_reassignment(terms, state, table_pi, current + 1e-9)
+        swapped, a, b = best_exchange(terms, state, table_pi, moved)
+        if a >= 0:
+            exchange(terms, state, a, b)
+        elif i >= 0:
+            remove(terms, state, i)
+            add(terms, state, i, ii)
+        else:
             break
-        change_match(terms, state, first, second, m)
         current = value(state.sums, state.size[0], table_pi)
 
 
 @njit(cache=True)
-def change_match(terms: Terms, state: State, i: int, to: int, m: int) -> None:
-    """Match source object i to the free target `to`, or exchange targets with source object `to - m`."""
-    if to < m:
-        remove(terms, state, i)
-        add(terms, state, i, to)
-        return
-    j = to - m
+def exchange(terms: Terms, state: State, i: int, j: int) -> None:
+    """Let the matched source objects i and j exchange their targets."""
     ii, jj = state.match[i], state.match[j]
     remove(terms, state, i)
     remove(terms, state, j)

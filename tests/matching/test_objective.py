@@ -66,6 +66,17 @@ def test_vertex_cosines_of_coincident_points_are_finite():
     assert (c == 0).all()
 
 
+def test_pair_affinity_is_eq_2_without_conflicting_matches():
+    rng = np.random.default_rng(1)
+    s, t = distances(rng.normal(size=(3, 3))), distances(rng.normal(size=(4, 3)))
+    D = pair_affinity(s, t, 0.7)
+    for i, j in permutations(range(3), 2):
+        for a, b in permutations(range(4), 2):
+            assert D[i, a, j, b] == pytest.approx(np.exp(-((s[i, j] - t[a, b]) ** 2) / 0.7))
+    assert all((D[i, :, i, :] == 0).all() for i in range(3))
+    assert all((D[:, a, :, a] == 0).all() for a in range(4))
+
+
 def test_triangle_sides_change_sign_under_reflection_only():
     rng = np.random.default_rng(0)
     p = rng.normal(size=(5, 3))
@@ -132,9 +143,7 @@ def literal_value(problem, match):
         if ii >= 0:
             X[i, ii] = 1
     x = ob.vec(X)
-    D = pair_affinity(terms.source_distance, terms.target_distance, terms.distance_width_m2)
-    D = D * terms.distance_weight[:, :, None, None] * terms.distance_weight[None, None]
-    D = D.transpose(1, 0, 3, 2).reshape(size, size)  # candidate i' n + i: by columns
+    D = terms.pair.transpose(1, 0, 3, 2).reshape(size, size)  # candidate i' n + i: by columns
     T = np.zeros((size, size, size))
     where = [(i, ii) for ii in range(m) for i in range(n)]
     for a, (i, ii) in enumerate(where):
@@ -171,7 +180,7 @@ def test_incremental_objective_equals_full(scaling, options):
     def full(match):
         return ob.objective(p.terms, match, p.table)
 
-    for _ in range(300):
+    for _ in range(150):
         match = state.match.copy()
         i = int(rng.integers(6))
         ii = int(rng.integers(5))
@@ -179,21 +188,33 @@ def test_incremental_objective_equals_full(scaling, options):
         changed = match.copy()
         if match[i] == ii:
             changed[i] = -1
-            predicted = ob.value_without(p.terms, state, p.table, i)
         elif holder < 0:
             changed[i] = ii
-            predicted = ob.value_after(p.terms, state, p.table, i, ii)
-        elif match[i] < 0:
-            changed[i], changed[holder] = ii, -1
-            predicted = ob.value_stolen(p.terms, state, p.table, i, holder)
+            assert ob.value_after(p.terms, state, p.table, i, ii) == pytest.approx(full(changed), abs=1e-9)
         else:
             changed[i], changed[holder] = ii, match[i]
-            predicted = ob.value_swapped(p.terms, state, p.table, i, holder)
-        assert predicted == pytest.approx(full(changed), abs=1e-9)
         ob_change(p.terms, state, match, changed)
         assert (state.match == changed).all()
         assert ob.value(state.sums, state.size[0], p.table) == pytest.approx(full(changed), abs=1e-9)
+        check_best_changes(p, state, full)
     np.testing.assert_allclose(state.sums, ob.full_sums(p.terms, state.match), atol=1e-9)
+
+
+def check_best_changes(p, state, full):
+    """The best reassignment and the best exchange have the values that the full objective gives them."""
+    now = full(state.match)
+    exchanges, reassignments = [now], [now]
+    for i in np.flatnonzero(state.match >= 0):
+        for j in np.flatnonzero(state.match >= 0):
+            changed = state.match.copy()
+            changed[[i, j]] = changed[[j, i]]
+            exchanges.append(full(changed))
+        for ii in np.flatnonzero(state.holder < 0):
+            changed = state.match.copy()
+            changed[i] = ii
+            reassignments.append(full(changed))
+    assert ob.best_exchange(p.terms, state, p.table, now)[0] == pytest.approx(max(exchanges), abs=1e-9)
+    assert ob.best_reassignment(p.terms, state, p.table, now)[0] == pytest.approx(max(reassignments), abs=1e-9)
 
 
 def ob_change(terms, state, before, after):
@@ -201,6 +222,16 @@ def ob_change(terms, state, before, after):
         ob.remove(terms, state, i)
     for i in np.flatnonzero((before != after) & (after >= 0)):
         ob.add(terms, state, i, after[i])
+
+
+def test_lists_of_triples_start_anew_when_full():
+    p = problem(np.random.default_rng(9), 6, 6, neighbours=1000)
+    state = ob.empty_state(6, 6)
+    state.list_used[0] = ob.LIST_CAPACITY + 1
+    for i in range(6):
+        ob.add(p.terms, state, i, 5 - i)
+        state.list_used[0] = max(state.list_used[0], ob.LIST_CAPACITY - 20 * i)
+    np.testing.assert_allclose(state.sums, ob.full_sums(p.terms, state.match), atol=1e-9)
 
 
 def test_removing_everything_leaves_nothing_behind():
