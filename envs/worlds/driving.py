@@ -8,103 +8,34 @@ only place where the two frames meet.
 from __future__ import annotations
 
 import copy
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from highway_env.vehicle.objects import Obstacle
+from numba import njit
+from numpy.typing import NDArray
 
-from .driving_maps import MAPS, RoadMap, Start, road_map
-from .street_meshes import bus, car, strip, truck, van
-from .traffic import ConnectedVehicle, FastRoad, TrafficVehicle, make_road
-from .world import Array, Light, Mesh, ObjectClass, SceneGenerationError, Snapshot
+from .driving_maps import RoadMap, Start, road_map
+from .driving_params import CAR, CLASSES, KINDS, PRESETS, WHITE, DrivingParams, Tint, draw_kind, draw_paint, preset
+from .kerbs import Ground, to_world
+from .lighting import sample_light
+from .road_surface import road_surface
+from .street import Catalogue, Street
+from .street_meshes import barrier, building, bus, car, person, sign, signal, tree, truck, van
+from .traffic import ConnectedVehicle, FastNetwork, FastRoad, TrafficVehicle, corners, make_road, rectangles_intersect
+from .world import Array, Light, Mesh, SceneGenerationError, Snapshot
 
 SIMULATION_HZ = 15
 SUBSTEPS = 3
 STATE_COLUMNS = ("speed_m_s", "yaw_rate_rad_s", "lane_offset_m", "lane_heading_rad", "speed_limit_m_s")
 MAX_TRIES = 30
+GROUNDS = ((104, 118, 84), (118, 120, 96), (122, 116, 104), (96, 110, 92))
+FOOTPRINTS = ((12.0, 9.0), (9.0, 9.0), (15.0, 10.0), (10.0, 8.0))
+FLOORS = (3, 5, 4, 2)
 
-CLASSES = (
-    ObjectClass("car", 1.3),
-    ObjectClass("van", 1.5),
-    ObjectClass("truck", 2.0),
-    ObjectClass("bus", 2.3),
-    ObjectClass("pedestrian", 0.15),
-    ObjectClass("traffic light", 0.15),
-    ObjectClass("road sign", 0.05),
-)
-
-
-@dataclass(frozen=True)
-class DrivingParams:
-    """What a connected-driving scene contains.
-
-    Attributes:
-        map: "intersection", "roundabout", "highway", "merge" or "racetrack".
-        n_vehicles: other vehicles at the start, as many as fit.
-        max_vehicles: other vehicles at any time.
-        spawn_probability: chance per step that another vehicle enters.
-        prewarm_s: traffic runs this long before the connected vehicles appear (s).
-        look_alike_fraction: share of objects whose look is drawn from the few common ones.
-        horizontal_fov_rad: full field of view of the cameras.
-        camera_height_m, camera_forward_m: mounting, from the ground below the vehicle's centre.
-        max_acceleration: m/s^2 at control 1.
-        max_steering_rad: steering angle at control 1.
-    """
-
-    map: str = "intersection"
-    n_vehicles: int = 14
-    max_vehicles: int = 18
-    spawn_probability: float = 0.3
-    prewarm_s: float = 3.0
-    look_alike_fraction: float = 0.8
-    horizontal_fov_rad: float = float(np.pi / 2)
-    camera_height_m: float = 1.5
-    camera_forward_m: float = 0.5
-    max_acceleration: float = 5.0
-    max_steering_rad: float = 0.6
-
-    def __post_init__(self) -> None:
-        if self.map not in MAPS:
-            raise ValueError(f"map must be one of {', '.join(sorted(MAPS))}, got {self.map!r}")
-        for name in ("n_vehicles", "max_vehicles", "prewarm_s"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
-        for name in ("spawn_probability", "look_alike_fraction"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)}")
-        if self.n_vehicles > self.max_vehicles:
-            raise ValueError(f"n_vehicles {self.n_vehicles} exceeds max_vehicles {self.max_vehicles}")
-        if not 0 < self.horizontal_fov_rad < np.pi:
-            raise ValueError(f"horizontal_fov_rad must be in (0, pi), got {self.horizontal_fov_rad}")
-        for name in ("camera_height_m", "max_acceleration", "max_steering_rad"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-
-
-@dataclass(frozen=True)
-class VehicleKind:
-    """A kind of vehicle: its class, its meshes (indices into the catalogue), size (m), and how common it is."""
-
-    object_class: int
-    meshes: tuple[int, ...]
-    size: tuple[float, float, float]
-    share: float
-
-
-VEHICLE_MESHES = ("sedan", "hatchback", "estate", "van", "truck", "bus")
-KINDS = (
-    VehicleKind(0, (0, 1, 2), (4.5, 1.8, 1.5), 0.66),
-    VehicleKind(1, (3,), (5.3, 1.95, 2.25), 0.16),
-    VehicleKind(2, (4,), (7.6, 2.3, 3.12), 0.1),
-    VehicleKind(3, (5,), (8.6, 2.35, 3.15), 0.08),
-)
-COMMON_TINTS = ((0.95, 0.95, 0.95), (0.62, 0.63, 0.66))
-RARE_TINTS = ((0.75, 0.12, 0.1), (0.12, 0.25, 0.6), (0.1, 0.35, 0.2), (0.85, 0.65, 0.1), (0.12, 0.12, 0.14))
-
-
-def to_world(points: Array) -> Array:
-    """Points (..., 2) of highway-env's road in our world: y mirrored (headings change sign too)."""
-    return points * np.array([1.0, -1.0])
+__all__ = ["PRESETS", "ConnectedDrivingWorld", "DrivingParams", "preset"]
 
 
 @dataclass
@@ -113,12 +44,15 @@ class _Episode:
 
     rng: np.random.Generator
     road: FastRoad
+    street: Street
     connected: list[ConnectedVehicle]
+    looks: dict[int, tuple[int, Tint]]  # identity of a vehicle in traffic -> mesh, tint
+    street_identity: NDArray[np.int64]  # (k,) identities of the street's objects
+    crossers: dict[int, Obstacle]  # index of a walker on the road -> what highway-env's drivers see of it
     light: Light
-    time: float
-    next_identity: int
     collided: list[bool]
-    looks: dict[int, tuple[int, tuple[float, float, float]]]  # identity -> mesh, tint
+    next_identity: int = 0
+    time: float = 0.0
 
 
 class ConnectedDrivingWorld:
@@ -130,14 +64,17 @@ class ConnectedDrivingWorld:
     """
 
     def __init__(self, n_robots: int = 2, params: DrivingParams | None = None) -> None:
+        """Raises ValueError for a number of connected vehicles that no map takes."""
         if not 2 <= n_robots <= 6:
             raise ValueError(f"n_robots must be between 2 and 6, got {n_robots}")
         self.params = params or DrivingParams()
         self.n_robots = n_robots
         self.map: RoadMap = road_map(self.params.map)
+        self._network = FastNetwork(self.map.network, connected_lanes=True)
+        self._ground = Ground(self.map, self._network.table)
         self.classes = CLASSES
-        self.meshes = _catalogue(self.map)
-        self.max_objects = self.params.max_vehicles + n_robots
+        self.meshes, self._catalogue, self._surface = _meshes(self.map, self._ground)
+        self.max_objects = self.params.max_objects + n_robots
         self.control_size = 2
         self.state_size = len(STATE_COLUMNS)
         self.horizontal_fov_rad = np.full(n_robots, self.params.horizontal_fov_rad)
@@ -165,12 +102,16 @@ class ConnectedDrivingWorld:
         wanted = np.asarray(controls, dtype=np.float64)
         if wanted.shape != (self.n_robots, 2) or not np.isfinite(wanted).all():
             raise ValueError(f"controls must be finite with shape ({self.n_robots}, 2), got {controls!r}")
-        self._spawn(episode, 0.0)
+        self._spawn(episode)
+        self._move_street(episode)
+        bodies = np.vstack([episode.street.solids, _pedestrians(episode.street)])
         for _ in range(SUBSTEPS):
             episode.road.act()
-            for vehicle, control in zip(episode.connected, np.clip(wanted, -1.0, 1.0), strict=True):
-                vehicle.act(self._command(vehicle, control))
+            for vehicle, control in zip(episode.connected, np.clip(wanted, -1.0, 1.0).tolist(), strict=True):
+                vehicle.act(self._command(vehicle, *control))
             episode.road.step(1 / SIMULATION_HZ)
+            for vehicle, hit in zip(episode.connected, touching(_cars(episode.connected), bodies), strict=True):
+                vehicle.crashed = bool(vehicle.crashed or hit)
         self._remove_leaving(episode)
         episode.collided = [bool(v.crashed) for v in episode.connected]
         episode.time += self.step_seconds
@@ -178,28 +119,40 @@ class ConnectedDrivingWorld:
     def snapshot(self) -> Snapshot:
         """The present instant."""
         episode = self._running()
+        n, street = self.n_robots, episode.street
         vehicles = [*episode.connected, *(v for v in episode.road.vehicles if not isinstance(v, ConnectedVehicle))]
-        m, n = len(vehicles), self.n_robots
-        planar = to_world(np.array([v.position for v in vehicles]))
-        headings = np.array([-v.heading for v in vehicles])
+        positions = np.vstack([to_world(np.array([v.position for v in vehicles])), *street.objects.positions])
+        headings = np.array([-v.heading for v in vehicles] + street.objects.headings)
+        sizes = np.array([KINDS[v.kind].size for v in vehicles] + street.objects.sizes)
+        m = len(positions)
+        velocities = np.zeros((m, 3))
         speeds = np.array([v.speed for v in vehicles])
-        sizes = np.array([KINDS[v.kind].size for v in vehicles])
-        direction = np.column_stack([np.cos(headings), np.sin(headings), np.zeros(m)])
-        velocities = speeds[:, None] * direction
-        poses = planar_poses(planar, headings)
+        velocities[: len(vehicles), 0] = speeds * np.cos(headings[: len(vehicles)])
+        velocities[: len(vehicles), 1] = speeds * np.sin(headings[: len(vehicles)])
+        velocities[len(vehicles) :, :2] = street.velocities()
         looks = [episode.looks[v.identity] for v in vehicles]
+        scenery = street.scenery
+        poses = planar_poses(
+            np.vstack([positions, *scenery.positions, *self._obstacle_positions(), np.zeros((1, 2))]),
+            np.concatenate([headings, scenery.headings, np.zeros(len(self.map.obstacles) + 1)]),
+        )
+        fixed = [self._surface - 1] * len(self.map.obstacles) + [self._surface]
         return Snapshot(
             time=episode.time,
-            identity=np.array([v.identity for v in vehicles], dtype=np.int64),
-            object_class=np.array([KINDS[v.kind].object_class for v in vehicles], dtype=np.int64),
-            positions=np.column_stack([planar, sizes[:, 2] / 2]),
+            identity=np.concatenate([[v.identity for v in vehicles], episode.street_identity]).astype(np.int64),
+            object_class=np.array([KINDS[v.kind].object_class for v in vehicles] + street.objects.classes, np.int64),
+            positions=np.column_stack([positions, sizes[:, 2] / 2]),
             velocities=velocities,
             headings=headings,
             sizes=sizes,
-            body_mesh=np.array([mesh for mesh, _ in looks] + [len(VEHICLE_MESHES)], dtype=np.int64),
-            body_poses=np.concatenate([poses, np.eye(4)[None]]),
-            body_tints=np.array([tint for _, tint in looks] + [(1.0, 1.0, 1.0)]),
-            body_object=np.append(np.arange(m), -1).astype(np.int64),
+            body_mesh=np.array(
+                [mesh for mesh, _ in looks] + street.objects.meshes + scenery.meshes + fixed, dtype=np.int64
+            ),
+            body_poses=poses,
+            body_tints=np.array(
+                [tint for _, tint in looks] + street.objects.tints + scenery.tints + [WHITE] * len(fixed)
+            ),
+            body_object=np.concatenate([np.arange(m), np.full(len(poses) - m, -1)]).astype(np.int64),
             T_world_camera=poses[:n] @ self._T_body_camera(),
             robot_object=np.arange(n, dtype=np.int64),
             robot_velocity=velocities[:n].copy(),
@@ -215,10 +168,9 @@ class ConnectedDrivingWorld:
     # --- beyond the protocol -----------------------------------------------------------------------------------------
 
     def idm_controls(self) -> Array:
-        """Controls (N, 2) that highway-env's IDM driver would give the connected vehicles now (privileged)."""
+        """Controls (N, 2) that highway-env's IDM driver would give the connected vehicles now; changes nothing."""
         episode = self._running()
-        episode.road.act()
-        advice = np.array([v.advised for v in episode.connected])
+        advice = np.array(episode.road.advice()).reshape(-1, 2)[[v in episode.connected for v in episode.road.vehicles]]
         return np.clip(advice * [1.0, -1.0] / [self.params.max_acceleration, self.params.max_steering_rad], -1.0, 1.0)
 
     def save_state(self) -> Any:
@@ -226,12 +178,16 @@ class ConnectedDrivingWorld:
         return self._copied(self._running())
 
     def restore_state(self, state: Any) -> None:
-        """Go back to a state of `save_state`, any number of times."""
+        """Go back to a state of `save_state`, any number of times.
+
+        Raises:
+            ValueError: something else.
+        """
         if not isinstance(state, _Episode):
             raise ValueError(f"state must come from save_state, got {type(state).__name__}")
         self._episode = self._copied(state)
 
-    # --- inside ------------------------------------------------------------------------------------------------------
+    # --- a step ------------------------------------------------------------------------------------------------------
 
     def _running(self) -> _Episode:
         if self._episode is None:
@@ -239,8 +195,9 @@ class ConnectedDrivingWorld:
         return self._episode
 
     def _copied(self, episode: _Episode) -> _Episode:
-        network = episode.road.network
-        shared = [network, network.table, *network.table.lanes, self.map]
+        table = self._network.table
+        shared = [self._network, table, *table.lanes, self._ground, self._catalogue, self.params]
+        shared += [*self._ground.pavements, *self._ground.crossings]
         return copy.deepcopy(episode, {id(item): item for item in shared})
 
     def _T_body_camera(self) -> Array:
@@ -249,28 +206,70 @@ class ConnectedDrivingWorld:
         T[:, 3] = self.params.camera_forward_m, 0.0, self.params.camera_height_m, 1.0
         return T
 
-    def _command(self, vehicle: ConnectedVehicle, control: Array) -> dict[str, float]:
-        acceleration = float(control[0]) * self.params.max_acceleration
-        return {
-            # Braking stops at a standstill: no reversing.
-            "acceleration": max(acceleration, -vehicle.speed * SIMULATION_HZ),
-            "steering": -float(control[1]) * self.params.max_steering_rad,
-        }
+    def _command(self, vehicle: ConnectedVehicle, pedal: float, wheel: float) -> dict[str, float]:
+        # Braking stops at a standstill: no reversing.
+        acceleration = max(pedal * self.params.max_acceleration, -max(vehicle.speed, 0.0) * SIMULATION_HZ)
+        return {"acceleration": acceleration, "steering": -wheel * self.params.max_steering_rad}
+
+    def _move_street(self, episode: _Episode) -> None:
+        """Pedestrians and signals; those who cross the road become obstacles that highway-env's drivers brake for."""
+        vehicles = episode.road.vehicles
+        arms = {lane: arm for arm, (lane, _) in enumerate(self.map.entries)}
+        held_back = {arms[v.lane_index] for v in vehicles if getattr(v, "is_yielding", False) and v.lane_index in arms}
+        moving = np.array([(*v.position, v.heading, v.speed) for v in vehicles])
+        moving[:, 1:3] *= -1
+        episode.street.step(self.step_seconds, episode.time, lambda point: _safe_to_cross(point, moving), held_back)
+        crossers = {}
+        for k, walker in enumerate(episode.street.walkers):
+            if walker.on_road:
+                position = to_world(walker.site()[0])
+                crossers[k] = episode.crossers.get(k) or _pedestrian_obstacle(episode.road, position)
+                crossers[k].position = position
+        episode.crossers = crossers
+        episode.road.objects = episode.road.objects[: len(self.map.obstacles)] + list(crossers.values())
+
+    def _spawn(self, episode: _Episode) -> None:
+        rng = episode.rng
+        if not self.map.entries or rng.uniform() > self.params.spawn_probability:
+            return
+        if len(episode.road.vehicles) - len(episode.connected) >= self.params.max_vehicles:
+            return
+        lane, _ = self.map.entries[int(rng.integers(len(self.map.entries)))]
+        self._add_vehicle(episode, lane, 0.0, gap=20.0)
+
+    def _remove_leaving(self, episode: _Episode) -> None:
+        graph, road = self.map.network.graph, episode.road
+        road.vehicles = [
+            v
+            for v in road.vehicles
+            if isinstance(v, ConnectedVehicle)
+            or v.lane_index[1] in graph
+            or v.lane.local_coordinates(v.position)[0] < v.lane.length - 20.0
+        ]
+
+    # --- generation --------------------------------------------------------------------------------------------------
 
     def _generate(self, rng: np.random.Generator) -> _Episode | None:
-        road = make_road(self.map, rng, connected_lanes=True)
-        episode = _Episode(rng, road, [], Light(), 0.0, 0, [False] * self.n_robots, {})
+        light = sample_light(rng, self.params.times_of_day, GROUNDS)
+        street = Street(rng, self.params, self._ground, self._catalogue)
+        road = make_road(self.map, rng, self._network)
+        nobody = np.zeros(0, dtype=np.int64)
+        episode = _Episode(rng, road, street, [], {}, nobody, {}, light, [False] * self.n_robots)
         self._populate(episode)
-        for _ in range(int(self.params.prewarm_s * SIMULATION_HZ)):
+        for _ in range(round(self.params.prewarm_s * SIMULATION_HZ)):
             road.act()
             road.step(1 / SIMULATION_HZ)
         self._remove_leaving(episode)
         road.vehicles = [v for v in road.vehicles if not v.crashed]
-        return episode if self._place_connected(episode) else None
+        if not self._place_connected(episode):
+            return None
+        episode.street_identity = episode.next_identity + np.arange(len(street.objects))
+        episode.next_identity += len(street.objects)
+        return episode
 
     def _populate(self, episode: _Episode) -> None:
-        rng = episode.rng
-        lanes = self.map.populated
+        """Fill the map with traffic, a bounded number of tries."""
+        rng, lanes = episode.rng, self.map.populated
         weights = np.array([end - begin for _, (begin, end) in lanes])
         for _ in range(6 * self.params.n_vehicles):
             if len(episode.road.vehicles) >= self.params.n_vehicles:
@@ -278,46 +277,30 @@ class ConnectedDrivingWorld:
             lane, (begin, end) = lanes[int(rng.choice(len(lanes), p=weights / weights.sum()))]
             self._add_vehicle(episode, lane, float(rng.uniform(begin, end)), gap=13.0)
 
-    def _spawn(self, episode: _Episode, longitudinal: float) -> None:
-        rng = episode.rng
-        if not self.map.entries or rng.uniform() > self.params.spawn_probability:
-            return
-        if len(episode.road.vehicles) - len(episode.connected) >= self.params.max_vehicles:
-            return
-        lane, _ = self.map.entries[int(rng.integers(len(self.map.entries)))]
-        self._add_vehicle(episode, lane, longitudinal, gap=20.0)
-
     def _add_vehicle(self, episode: _Episode, lane: tuple[str, str, int], longitudinal: float, gap: float) -> None:
-        rng = episode.rng
+        """Add one vehicle of the traffic, unless another is nearer than `gap` m."""
+        rng, road = episode.rng, episode.road
         where = self.map.network.get_lane(lane)
-        limit = where.speed_limit or 10.0
-        speed = float(limit * rng.uniform(0.6, 0.9))
-        kind = int(rng.choice(len(KINDS), p=[k.share for k in KINDS]))
-        position = where.position(longitudinal, 0)
-        if any(np.hypot(*(v.position - position)) < gap for v in episode.road.vehicles):
+        speed = float((where.speed_limit or 10.0) * rng.uniform(0.6, 0.9))
+        kind = draw_kind(rng)
+        if not _far_from(road.vehicles, where.position(longitudinal, 0.0), gap):
             return
-        vehicle = TrafficVehicle.make_on_lane(episode.road, lane, longitudinal, speed)
+        vehicle = TrafficVehicle.make_on_lane(road, lane, longitudinal, speed)
         self._enroll(episode, vehicle, kind)
         vehicle.randomize_behavior()
-        goals = dict(self.map.entries).get(lane) or _onward(self.map, lane)
+        goals = dict(self.map.entries).get(lane) or self.map.goals
         if goals:
             vehicle.plan_route_to(str(rng.choice(goals)))
-        episode.road.vehicles.append(vehicle)
+        road.vehicles.append(vehicle)
 
     def _enroll(self, episode: _Episode, vehicle: TrafficVehicle, kind: int) -> None:
         """Give a new vehicle its identity, size, look and driving style."""
-        rng = episode.rng
         vehicle.identity, vehicle.kind = episode.next_identity, kind
         episode.next_identity += 1
-        length, width, _ = KINDS[kind].size
-        vehicle.resize(length, width)
+        vehicle.resize(*KINDS[kind].size[:2])
         for name, value in self.map.driving_style.items():
             setattr(vehicle, name, value)
-        meshes = KINDS[kind].meshes
-        common = rng.uniform() < self.params.look_alike_fraction
-        tints = COMMON_TINTS if common else RARE_TINTS
-        mesh = meshes[0] if common else int(rng.choice(meshes))
-        episode.looks[vehicle.identity] = (mesh, tints[int(rng.integers(len(tints)))])
+        episode.looks[vehicle.identity] = draw_paint(episode.rng, kind, self.params.look_alike_fraction)
 
     def _place_connected(self, episode: _Episode) -> bool:
         """Put the connected vehicles at their starts and clear what is too close; False when there is no room."""
@@ -327,32 +310,24 @@ class ConnectedDrivingWorld:
             starts = [starts[int(k)] for k in rng.permutation(len(starts))]
         for n in range(self.n_robots):
             start = starts[n % len(starts)]
-            behind = (n // len(starts)) * self.map.queue_gap_m
-            longitudinal = float(rng.uniform(*start.longitudinal)) - behind
-            vehicle = ConnectedVehicle.make_on_lane(road, start.lane, longitudinal, float(rng.uniform(*self.map.speed)))
-            if any(np.hypot(*(v.position - vehicle.position)) < 7.0 for v in episode.connected):
+            longitudinal = float(rng.uniform(*start.longitudinal)) - (n // len(starts)) * self.map.queue_gap_m
+            speed = float(rng.uniform(*self.map.speed))
+            vehicle = ConnectedVehicle.make_on_lane(road, start.lane, longitudinal, speed)
+            if not _far_from(episode.connected, vehicle.position, 7.0):
                 return False
-            self._enroll(episode, vehicle, 0)
+            self._enroll(episode, vehicle, CAR)
             vehicle.target_speed = vehicle.lane.speed_limit or 10.0
             if start.destinations:
                 vehicle.plan_route_to(str(rng.choice(start.destinations)))
             road.vehicles = [
-                v for v in road.vehicles if np.hypot(*(v.position - vehicle.position)) >= 11.0 or v in episode.connected
+                v for v in road.vehicles if v in episode.connected or _far_from([v], vehicle.position, 11.0)
             ]
             road.vehicles.append(vehicle)
             episode.connected.append(vehicle)
-        return len(road.vehicles) >= self.n_robots and all(v in road.vehicles for v in episode.connected)
+        return not touching(_cars(episode.connected), episode.street.solids).any()
 
-    def _remove_leaving(self, episode: _Episode) -> None:
-        graph = self.map.network.graph
-        road = episode.road
-        road.vehicles = [
-            v
-            for v in road.vehicles
-            if isinstance(v, ConnectedVehicle)
-            or v.lane_index[1] in graph
-            or v.lane.local_coordinates(v.position)[0] < v.lane.length - 20.0
-        ]
+    def _obstacle_positions(self) -> list[Array]:
+        return [to_world(position) for position in self.map.obstacles]
 
 
 def planar_poses(positions: Array, headings: Array) -> Array:
@@ -365,36 +340,77 @@ def planar_poses(positions: Array, headings: Array) -> Array:
     return poses
 
 
+@njit(cache=True)
+def touching(cars: Array, bodies: Array) -> NDArray[np.bool_]:
+    """(n,) whether each rectangle of cars (n, 5) x, y, heading, length, width overlaps any of bodies (k, 5)."""
+    out = np.zeros(len(cars), dtype=np.bool_)
+    for i in range(len(cars)):
+        x, y, heading, length, width = cars[i]
+        for j in range(len(bodies)):
+            u, v, turn, long, wide = bodies[j]
+            if math.hypot(u - x, v - y) > (math.hypot(length, width) + math.hypot(long, wide)) / 2:
+                continue
+            now, _ = rectangles_intersect(
+                corners(x, y, heading, length, width), corners(u, v, turn, long, wide), 0.0, 0.0, 0.0, 0.0
+            )
+            out[i] |= now
+    return out
+
+
+@njit(cache=True)
+def _safe_to_cross(point: Array, vehicles: Array) -> bool:
+    """Whether no vehicle, rows x, y, heading, speed, is too near to brake comfortably for somebody at `point`."""
+    for k in range(len(vehicles)):
+        x, y, heading, speed = vehicles[k]
+        ahead = math.cos(heading) * (point[0] - x) + math.sin(heading) * (point[1] - y)
+        beside = math.cos(heading) * (point[1] - y) - math.sin(heading) * (point[0] - x)
+        if abs(beside) < 7.0 and -4.0 < ahead < speed * speed / 5.0 + 8.0 and speed > 0.5:
+            return False
+    return True
+
+
+def _far_from(vehicles: list[Any], position: Array, distance_m: float) -> bool:
+    x, y = float(position[0]), float(position[1])
+    return all(math.hypot(v.position[0] - x, v.position[1] - y) >= distance_m for v in vehicles)
+
+
+def _cars(vehicles: list[ConnectedVehicle]) -> Array:
+    """(n, 5) x, y, heading, length, width in the world frame."""
+    return np.array([(v.position[0], -v.position[1], -v.heading, v.LENGTH, v.WIDTH) for v in vehicles])
+
+
+def _pedestrians(street: Street) -> Array:
+    return street.objects.footprints()[len(street.objects) - len(street.walkers) :]
+
+
+def _pedestrian_obstacle(road: FastRoad, position: Array) -> Obstacle:
+    obstacle = Obstacle(road, position)
+    obstacle.LENGTH = obstacle.WIDTH = 0.6
+    obstacle.diagonal = math.sqrt(2) * 0.6
+    return obstacle
+
+
 def _own_state(vehicle: ConnectedVehicle) -> list[float]:
     longitudinal, lateral = vehicle.lane.local_coordinates(vehicle.position)
-    slip = np.arctan(0.5 * np.tan(vehicle.action["steering"]))
-    yaw_rate = vehicle.speed * np.sin(slip) / (vehicle.LENGTH / 2)
-    return [
-        vehicle.speed,
-        -float(yaw_rate),
-        -float(lateral),
-        -float(vehicle.lane.local_angle(vehicle.heading, longitudinal)),
-        vehicle.lane.speed_limit or 0.0,
-    ]
+    slip = math.atan(0.5 * math.tan(vehicle.action["steering"]))
+    yaw_rate = vehicle.speed * math.sin(slip) / (vehicle.LENGTH / 2)
+    turned = float(vehicle.lane.local_angle(vehicle.heading, longitudinal))
+    return [vehicle.speed, -yaw_rate, -float(lateral), -turned, vehicle.lane.speed_limit or 0.0]
 
 
-def _onward(roads: RoadMap, lane: tuple[str, str, int]) -> tuple[str, ...]:
-    """Nodes that vehicles starting on a populated lane may go to: all that any entry leads to."""
-    return tuple(sorted({goal for _, goals in roads.entries for goal in goals}))
-
-
-def _catalogue(roads: RoadMap) -> tuple[Mesh, ...]:
-    vehicles = (car("sedan"), car("hatchback"), car("estate"), van(), truck(), bus())
-    return (*vehicles, _asphalt(roads))
-
-
-def _asphalt(roads: RoadMap) -> Mesh:
-    from ..camera.shapes import merge
-
-    parts = []
-    for lane in roads.network.lanes_list():
-        s = np.linspace(0, min(float(lane.length), 600.0), 20)
-        left = to_world(np.array([lane.position(x, -lane.width_at(x) / 2) for x in s]))
-        right = to_world(np.array([lane.position(x, lane.width_at(x) / 2) for x in s]))
-        parts.append(strip(left, right, 0.02, (78, 80, 84)))
-    return merge(*parts)
+def _meshes(roads: RoadMap, ground: Ground) -> tuple[tuple[Mesh, ...], Catalogue, int]:
+    """Every mesh of a map, where the street's are among them, and the index of the ground; the barrier is before it."""
+    meshes = [car("sedan"), car("hatchback"), car("estate"), van(), truck(), bus(), person()]
+    groups = {
+        "signals": [signal(color) for color in ("red", "amber", "green")],
+        "signs": [sign(kind) for kind in ("limit", "stop", "yield", "info")],
+        "trees": [tree("round"), tree("tall")],
+        "houses": [building(*size, floors) for size, floors in zip(FOOTPRINTS, FLOORS, strict=True)],
+    }
+    indices = {}
+    for name, group in groups.items():
+        indices[name] = tuple(range(len(meshes), len(meshes) + len(group)))
+        meshes += group
+    meshes += [barrier(), road_surface(roads, ground.runs)]
+    catalogue = Catalogue(person=6, footprints=FOOTPRINTS, **indices)  # type: ignore[arg-type]
+    return tuple(meshes), catalogue, len(meshes) - 1

@@ -55,7 +55,8 @@ class RoadMap:
         speed: (m/s) of connected vehicles at the start.
         driving_style: IDM constants that highway-env's own environment of this name sets.
         view: (x0, y0, x1, y1) m, the part of the map that is furnished and drawn.
-        crossings: pedestrian crossings, (c, 2, 2) m, end points of each.
+        crossings: pedestrian crossings, (c, 2, 2) m, from pavement to pavement; crossing k lies on the arm of entry k.
+        focus: (x, y) m, where the street is busiest.
     """
 
     name: str
@@ -70,7 +71,13 @@ class RoadMap:
     driving_style: dict[str, float]
     view: tuple[float, float, float, float]
     crossings: Array
+    focus: tuple[float, float]
     queue_gap_m: float = 14.0
+
+    @property
+    def goals(self) -> tuple[str, ...]:
+        """Every node that some entry leads to."""
+        return tuple(sorted({goal for _, goals in self.entries for goal in goals}))
 
 
 def _road_of(environment: Any, make: str = "_make_road", **config: Any) -> Any:
@@ -92,7 +99,7 @@ def intersection() -> RoadMap:
     crossings = []
     for k in arms:
         c, s = np.cos(np.pi / 2 * k), np.sin(np.pi / 2 * k)
-        crossings.append(np.array([[-6.2, 14.5], [6.2, 14.5]]) @ np.array([[c, s], [-s, c]]))
+        crossings.append(np.array([[-8.0, 14.5], [8.0, 14.5]]) @ np.array([[c, s], [-s, c]]))
     return RoadMap(
         name="intersection",
         network=road.network,
@@ -106,6 +113,7 @@ def intersection() -> RoadMap:
         driving_style={"DISTANCE_WANTED": 9.0, "COMFORT_ACC_MAX": 6.0, "COMFORT_ACC_MIN": -3.0},
         view=(-75.0, -75.0, 75.0, 75.0),
         crossings=np.array(crossings),
+        focus=(0.0, 0.0),
     )
 
 
@@ -128,7 +136,7 @@ def roundabout() -> RoadMap:
     on_ring = [((a, b, lane), (2.0, 14.0)) for a, b in ring for lane in (0, 1)]
     y = 47.0
     crossings = np.array(
-        [[[-6.2, y], [6.2, y]], [[y, -6.2], [y, 6.2]], [[-6.2, -y], [6.2, -y]], [[-y, -6.2], [-y, 6.2]]]
+        [[[-8.0, y], [8.0, y]], [[y, -8.0], [y, 8.0]], [[-8.0, -y], [8.0, -y]], [[-y, -8.0], [-y, 8.0]]]
     )
     return RoadMap(
         name="roundabout",
@@ -143,6 +151,7 @@ def roundabout() -> RoadMap:
         driving_style={},
         view=(-85.0, -85.0, 85.0, 85.0),
         crossings=crossings,
+        focus=(0.0, 0.0),
     )
 
 
@@ -163,6 +172,7 @@ def highway() -> RoadMap:
         driving_style={},
         view=(40.0, -30.0, 640.0, 42.0),
         crossings=np.zeros((0, 2, 2)),
+        focus=(158.0, 6.0),
         queue_gap_m=30.0,
     )
 
@@ -188,6 +198,7 @@ def merge() -> RoadMap:
         driving_style={},
         view=(40.0, -30.0, 460.0, 45.0),
         crossings=np.zeros((0, 2, 2)),
+        focus=(165.0, 6.0),
         queue_gap_m=26.0,
     )
 
@@ -213,6 +224,7 @@ def racetrack() -> RoadMap:
         driving_style={},
         view=(-45.0, -75.0, 145.0, 45.0),
         crossings=np.zeros((0, 2, 2)),
+        focus=(88.0, 2.5),
         queue_gap_m=16.0,
     )
 

@@ -9,7 +9,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..camera.shapes import Color, box, merge, paint, side_profile, translate, wheel
+from ..camera.shapes import (
+    Color,
+    box,
+    cone,
+    cylinder,
+    merge,
+    mesh,
+    paint,
+    prism,
+    rotate,
+    side_profile,
+    sphere,
+    translate,
+    wheel,
+)
 from .world import Array, Mesh
 
 WHITE: Color = (250, 250, 250)
@@ -103,3 +117,121 @@ def strip(left: Array, right: Array, z: float, color: Color) -> Mesh:
 def lift(body: Mesh, z: float) -> Mesh:
     """The mesh raised by z m."""
     return translate(body, (0, 0, z))
+
+
+def person() -> Mesh:
+    """A pedestrian 1.75 m tall in mid-stride; coat takes the tint."""
+    trousers, skin, hair = (52, 56, 70), (214, 168, 138), (70, 50, 38)
+    legs = [
+        translate(rotate(box((0.16, 0.15, 0.86), trousers, (0, 0, -0.43)), (0, 1, 0), swing), (0, side * 0.1, 0.86))
+        for side, swing in ((-1, 0.3), (1, -0.3))
+    ]
+    arms = [
+        translate(rotate(box((0.11, 0.1, 0.6), WHITE, (0, 0, -0.3)), (0, 1, 0), -swing), (0, side * 0.28, 1.38))
+        for side, swing in ((-1, 0.35), (1, -0.35))
+    ]
+    torso = prism([(-0.12, -0.17), (0.12, -0.17), (0.12, 0.17), (-0.12, 0.17)], 0.6, WHITE, top_scale=1.25)
+    head = sphere((0.11, 0.1, 0.13), skin, rings=4, sides=6, center=(0, 0, 1.6))
+    cap = sphere((0.12, 0.11, 0.09), hair, rings=4, sides=6, center=(-0.02, 0, 1.67))
+    return merge(*legs, *arms, translate(torso, (0, 0, 0.82)), head, cap)
+
+
+def signal(lit: str) -> Mesh:
+    """A traffic light 3.4 m high whose lamps face +x; `lit` is "red", "amber" or "green"."""
+    colors = {"red": ((255, 46, 36), (58, 22, 20)), "amber": ((255, 190, 40), (60, 48, 18))}
+    colors["green"] = ((60, 255, 120), (16, 56, 32))
+    lamps = [
+        box((0.06, 0.24, 0.24), colors[name][0] if name == lit else colors[name][1], (0.18, 0, z))
+        for name, z in (("red", 3.15), ("amber", 2.85), ("green", 2.55))
+    ]
+    post = cylinder(0.08, 2.4, (92, 96, 100), sides=6, center=(0, 0, 1.2))
+    return merge(
+        post,
+        box((0.3, 0.42, 1.0), (34, 36, 40), (0, 0, 2.85)),
+        box((0.04, 0.6, 1.18), (20, 21, 24), (-0.02, 0, 2.85)),
+        *lamps,
+    )
+
+
+def sign(kind: str) -> Mesh:
+    """A road sign 2.7 m high facing +x: "limit", "stop", "yield" or "info"."""
+    post = cylinder(0.045, 2.2, (150, 152, 156), sides=6, center=(0, 0, 1.1))
+    face = {"limit": (16, 0.0), "stop": (8, np.pi / 8), "yield": (3, np.pi + np.pi / 3), "info": (4, np.pi / 4)}
+    sides, turn = face[kind]
+    rim = {"limit": (205, 30, 34), "stop": (200, 28, 30), "yield": (205, 30, 34), "info": (36, 84, 170)}[kind]
+    inner = {"limit": (245, 245, 245), "stop": (214, 40, 40), "yield": (245, 245, 245), "info": (52, 108, 200)}[kind]
+    disc = rotate(cylinder(0.46, 0.04, rim, sides=sides, axis="x"), (1, 0, 0), turn)
+    middle = rotate(cylinder(0.34, 0.06, inner, sides=sides, axis="x"), (1, 0, 0), turn)
+    mark = {
+        "limit": box((0.08, 0.26, 0.2), (40, 40, 44)),
+        "stop": box((0.08, 0.5, 0.12), WHITE),
+        "yield": box((0.065, 0.02, 0.02), WHITE),
+        "info": box((0.08, 0.1, 0.36), WHITE),
+    }[kind]
+    return merge(post, *(translate(part, (0.06, 0, 2.24)) for part in (disc, middle, mark)))
+
+
+def tree(kind: str = "round") -> Mesh:
+    """A street tree: "round" (5.5 m) or "tall" (7.5 m); the crown takes the tint."""
+    bark = (96, 74, 54)
+    if kind == "tall":
+        crown = [
+            cone(1.5, 3.2, (96, 140, 84), sides=8, center=(0, 0, 2.0)),
+            cone(1.15, 3.0, (110, 152, 92), sides=8, center=(0, 0, 4.2)),
+        ]
+        return merge(cylinder(0.16, 2.2, bark, sides=6, center=(0, 0, 1.1)), *crown)
+    crown = [
+        sphere((1.7, 1.7, 1.4), (104, 148, 84), rings=4, sides=8, center=(0, 0, 3.7)),
+        sphere((1.1, 1.1, 1.0), (122, 164, 96), rings=4, sides=7, center=(0.4, 0.3, 4.7)),
+    ]
+    return merge(cylinder(0.18, 2.7, bark, sides=6, center=(0, 0, 1.35)), *crown)
+
+
+def building(length: float, depth: float, floors: int, *, shop: bool = True) -> Mesh:
+    """A house `length` x `depth` m, facade to -y side at y = -depth / 2; windows all round, walls take the tint."""
+    height = 3.2 * floors + 0.6
+    walls = box((length, depth, height), (235, 232, 226), (0, 0, height / 2))
+    roof = box((length + 0.5, depth + 0.5, 0.35), (120, 112, 106), (0, 0, height + 0.17))
+    panes = []
+    for floor in range(floors):
+        z = 3.2 * floor + 1.9
+        base = shop and floor == 0
+        glass = (70, 86, 100) if base else (84, 100, 118)
+        for span, reach, turn in ((length, depth, 0.0), (depth, length, np.pi / 2)):
+            count = max(int(span // 3.0), 1)
+            for side in (0.0, np.pi):
+                for k in range(count):
+                    x = (k + 0.5) * span / count - span / 2
+                    width = span / count * (0.8 if base else 0.45)
+                    panes.append(
+                        rotate(
+                            _pane(x, -reach / 2 - 0.03, z - 0.2 * base, width, 2.2 if base else 1.6, glass),
+                            (0, 0, 1),
+                            turn + side,
+                        )
+                    )
+    return merge(walls, roof, *panes)
+
+
+def _pane(x: float, y: float, z: float, width: float, height: float, color: Color) -> Mesh:
+    """An upright rectangle facing -y."""
+    w, h = width / 2, height / 2
+    corners = [(x - w, y, z - h), (x + w, y, z - h), (x + w, y, z + h), (x - w, y, z + h)]
+    return mesh(corners, [(0, 1, 2), (0, 2, 3)], color)
+
+
+def lamp_post() -> Mesh:
+    """A street lamp 6 m high reaching over the road towards +y."""
+    steel = (120, 124, 128)
+    return merge(
+        cylinder(0.09, 6.0, steel, sides=6, center=(0, 0, 3.0)),
+        box((0.12, 1.6, 0.1), steel, (0, 0.75, 5.95)),
+        box((0.25, 0.6, 0.12), (235, 235, 220), (0, 1.4, 5.88)),
+    )
+
+
+def barrier() -> Mesh:
+    """A striped barrier 2 m wide, where a lane ends."""
+    red = (210, 50, 44)
+    stripes = [box((0.26, 0.34, 0.5), red if k % 2 else WHITE, (0, -0.85 + 0.34 * k, 0.75)) for k in range(6)]
+    return merge(box((2.0, 2.0, 0.5), (190, 188, 180), (0, 0, 0.25)), *stripes)

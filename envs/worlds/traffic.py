@@ -71,16 +71,11 @@ class TrafficVehicle(IDMVehicle):
 
 
 class ConnectedVehicle(TrafficVehicle):
-    """A vehicle that we drive: it holds our acceleration and steering, and still knows its route.
-
-    Attributes:
-        advised: (acceleration m/s^2, steering rad) that an IDM driver would apply now.
-    """
+    """A vehicle that we drive: it holds our acceleration and steering, and still knows its route."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.enable_lane_change = False
-        self.advised = (0.0, 0.0)
 
     def act(self, action: dict[str, float] | None = None) -> None:
         """Hold `action`; without one, only keep following the route (highway-env's road calls this)."""
@@ -165,6 +160,7 @@ class FastNetwork(RoadNetwork):
     def __init__(self, network: RoadNetwork, connected_lanes: bool = False) -> None:
         super().__init__()
         self.graph = network.graph
+        self.connected_lanes = connected_lanes
         self.table = LaneTable(network, connected_lanes)
 
     def get_closest_lane_index(self, position: Array, heading: float | None = None) -> LaneIndex:
@@ -178,8 +174,8 @@ class FastRoad(RegulatedRoad):
     Same vehicles, rules and order of decisions as highway-env's; the tests compare them.
     """
 
-    def __init__(self, network: FastNetwork, rng: np.random.Generator, regulated: bool, connected_lanes: bool) -> None:
-        super().__init__(network=network, np_random=rng, neighbour_vehicles_connected_lanes=connected_lanes)
+    def __init__(self, network: FastNetwork, rng: np.random.Generator, regulated: bool) -> None:
+        super().__init__(network=network, np_random=rng, neighbour_vehicles_connected_lanes=network.connected_lanes)
         self.regulated = regulated
 
     def act(self) -> None:
@@ -187,21 +183,26 @@ class FastRoad(RegulatedRoad):
         if not self.vehicles:
             return
         lanes = self.network.table
-        n = len(self.vehicles)
-        bodies = np.vstack([vehicle_table(self.vehicles, lanes), obstacle_table(self.objects)])
-        angles = lanes.angles(bodies)
-        ended = past_end(lanes.rows, bodies[:n], angles)
-        for k, vehicle in enumerate(self.vehicles):
+        ended = past_end(lanes.rows, *self._bodies()).tolist()
+        for vehicle, done in zip(self.vehicles, ended, strict=False):
             if not vehicle.crashed:
-                _choose_lane(vehicle, bool(ended[k]))
-                bodies[k, V_TARGET] = lanes.row_of[vehicle.target_lane_index]
+                _choose_lane(vehicle, done)
+        for vehicle, (pedal, wheel) in zip(self.vehicles, self.advice(), strict=True):
+            if not (vehicle.crashed or isinstance(vehicle, ConnectedVehicle)):
+                vehicle.action = {"steering": wheel, "acceleration": pedal}
+
+    def advice(self) -> list[tuple[float, float]]:
+        """Acceleration (m/s^2) and steering (rad) that the IDM gives each vehicle on its present target lane."""
+        lanes, n = self.network.table, len(self.vehicles)
+        bodies, angles = self._bodies()
         seen = situations(lanes.rows, lanes.connected, lanes.offsets, bodies, n, angles)
         accelerations, steering = idm_commands(bodies[:n], seen)
-        for vehicle, pedal, wheel in zip(self.vehicles, accelerations.tolist(), steering.tolist(), strict=True):
-            if isinstance(vehicle, ConnectedVehicle):
-                vehicle.advised = (pedal, wheel)
-            elif not vehicle.crashed:
-                vehicle.action = {"steering": wheel, "acceleration": pedal}
+        return list(zip(accelerations.tolist(), steering.tolist(), strict=True))
+
+    def _bodies(self) -> tuple[Array, Array]:
+        """The table of vehicles and obstacles, and their directions from the lanes' centres."""
+        bodies = np.vstack([vehicle_table(self.vehicles, self.network.table), obstacle_table(self.objects)])
+        return bodies, self.network.table.angles(bodies)
 
     def step(self, dt: float) -> None:
         """Move all by `dt` s: `Road.step`, and on a regulated road the right of way twice a second."""
@@ -654,8 +655,8 @@ def outline(body: Array) -> Array:
 def collisions(bodies: Array, n: int, dt: float) -> Ints:
     """Pairs of bodies, the first of them one of the first n, that touch or will within `dt` s.
 
-    Rows [i, j, intersecting, will intersect], in the order of `Road.step`: for every vehicle the later vehicles, then all
-    obstacles.
+    Rows [i, j, intersecting, will intersect], in the order of `Road.step`: for every vehicle the
+    later vehicles, then all obstacles.
     """
     found = [(0, 0, 0, 0)]
     for i in range(n):
@@ -750,9 +751,9 @@ def predicted_conflicts(lanes: Array, vehicles: Array, routes: Ints, times: Arra
 # --- highway-env's own, for comparison -----------------------------------------------------------------------------
 
 
-def make_road(road_map: RoadMap, rng: np.random.Generator, connected_lanes: bool = False) -> FastRoad:
+def make_road(road_map: RoadMap, rng: np.random.Generator, network: FastNetwork) -> FastRoad:
     """An empty fast road of this map, with highway-env's own obstacles on it."""
-    road = FastRoad(FastNetwork(road_map.network, connected_lanes), rng, road_map.regulated, connected_lanes)
+    road = FastRoad(network, rng, road_map.regulated)
     road.objects = [Obstacle(road, position) for position in road_map.obstacles]
     return road
 
