@@ -6,7 +6,7 @@ No matcher and no perception is involved: this is what presets are judged by.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -85,15 +85,18 @@ def scene_statistics(
     width: int = 320,
     height: int = 240,
     min_pixels: int = 60,
+    controls: Callable[[World], Array] | None = None,
 ) -> SceneStatistics:
-    """Statistics of `world` at the given `steps` of one episode per seed, observers standing still.
+    """Statistics of `world` at the given `steps` of one episode per seed.
 
-    The world is reset but not closed.
+    `controls(world)` gives the controls (N, d) of each step; None = observers stand still. The world is reset but not
+    closed.
 
     Raises:
         ValueError: no seed or no step was given.
     """
     raster = Rasterizer(world.meshes, width, height)
+    still = np.zeros((world.n_robots, world.control_size))
     instants: list[tuple[Snapshot, list[View]]] = []
     for seed in seeds:
         world.reset(np.random.default_rng(seed))
@@ -101,7 +104,7 @@ def scene_statistics(
             if step in steps:
                 snapshot = world.snapshot()
                 instants.append((snapshot, [view(world, snapshot, raster, k) for k in range(world.n_robots)]))
-            world.step(np.zeros((world.n_robots, world.control_size)))
+            world.step(still if controls is None else controls(world))
     if not instants:
         raise ValueError("scene_statistics needs at least one seed and one step")
     return _pooled(instants, min_pixels)
