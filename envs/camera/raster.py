@@ -7,23 +7,70 @@ triangle numbers; draw the ground plane z = 0 and the sky; put the bodies' pixel
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..worlds.world import Array, Light, Mesh, Snapshot
-from ._kernels import NOISE_SIZE, TRIANGLE_FIELDS, render_kernel
-from .shapes import normals
+from ._background import NOISE_SIZE, draw_background
+from ._foreground import draw_foreground, mean_colors
+from ._triangles import (
+    BAD_POSE,
+    NO_MESH,
+    PATTERNED,
+    SMOOTH,
+    TABLE_FULL,
+    TRIANGLE_FIELDS,
+    draw_bodies,
+    draw_shadows,
+)
+from .shapes import PATTERNS, corner_normals, extent, normals, pattern_axes
 
 NEAR_M = 0.05
 """Nothing nearer than this along the optical axis is drawn."""
 
-HAZE_M = 350.0
-"""Distance at which half of the colour is the horizon's."""
-
 NOBODY = -1
+
+
+@dataclass(frozen=True)
+class Look:
+    """What is drawn beyond shape and colour; nothing here changes depth or instances.
+
+    Attributes:
+        smooth: round what is round: brightness runs smoothly over edges of less than 46 degrees.
+        patterns: draw the meshes' patterns.
+        shadows: shadows that the sun casts on the ground, and on bodies that lie flat on it.
+        contact: darkness of the ground about the feet of bodies, in [0, 1].
+        clouds: strength of clouds, in [0, 1].
+        haze_m: distance at which half of the colour is the horizon's.
+        samples: colours are the mean of samples x samples points of each pixel, against jagged edges; 1 is off.
+
+    Raises:
+        ValueError: a value out of its range.
+    """
+
+    smooth: bool = True
+    patterns: bool = True
+    shadows: bool = True
+    contact: float = 0.6
+    clouds: float = 0.6
+    haze_m: float = 350.0
+    samples: int = 1
+
+    def __post_init__(self) -> None:
+        for name in ("contact", "clouds"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)}")
+        if not self.haze_m > 0:
+            raise ValueError(f"haze_m must be positive, got {self.haze_m}")
+        if self.samples not in (1, 2, 3, 4):
+            raise ValueError(f"samples must be 1, 2, 3 or 4, got {self.samples}")
+
+
+PLAIN = Look(smooth=False, patterns=False, shadows=False, contact=0.0, clouds=0.0)
+"""Flat faces, ground and sky: the fastest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +107,7 @@ class Rasterizer:
     Args:
         meshes: every mesh a snapshot may refer to.
         width, height: pixels.
+        look: shading, patterns, shadows, anti-aliasing.
         sample_offset: where in a pixel it is sampled, (right, down); (0.5, 0.5) is its centre.
         near_m: distance of the near plane, m.
         own_body: whether a robot's camera sees the robot itself.
@@ -74,6 +122,7 @@ class Rasterizer:
         width: int,
         height: int,
         *,
+        look: Look = Look(),
         sample_offset: tuple[float, float] = (0.5, 0.5),
         near_m: float = NEAR_M,
         own_body: bool = False,
@@ -85,13 +134,32 @@ class Rasterizer:
         self.width, self.height = int(width), int(height)
         self.sample_offset = (float(sample_offset[0]), float(sample_offset[1]))
         self.near_m, self.own_body = float(near_m), bool(own_body)
-        self._geometry = _pack(meshes)
+        self.look = look
+        # With several samples the colours come from the finer picture: this one gives depth and instances.
+        own = PLAIN if look.samples > 1 else look
+        self._geometry = _pack(meshes, own)
         self._inverse_depth = np.zeros((height, width), np.float32)
         self._triangle_at = np.zeros((height, width), np.int32)
         self._spans = np.tile(np.array([[width, 0]], np.int32), (height, 1))
-        self._projected = np.empty((max((len(m.vertices) for m in meshes), default=1), 6))
+        self._shadow = np.zeros((height, width), np.uint8)
+        self._contact = np.zeros((height, width), np.uint8)
+        self._shadow_spans = self._spans.copy()
+        self._shaded = own.shadows or own.contact > 0
+        self._look = np.array([own.contact, own.shadows, own.clouds])
+        self._projected = np.empty((max(4, *(len(m.vertices) for m in meshes), 4), 5))
         self._triangles = np.empty((1024, TRIANGLE_FIELDS), np.float32)
         self._noise = _noise_tile().ravel()
+        self._fine: Rasterizer | None = None
+        if look.samples > 1:
+            self._fine = Rasterizer(
+                meshes,
+                width * look.samples,
+                height * look.samples,
+                look=replace(look, samples=1),
+                near_m=near_m,
+                own_body=own_body,
+            )
+            self._fine_frame = Frame.empty(self._fine.width, self._fine.height)
 
     def render(self, snapshot: Snapshot, robot: int, intrinsics: Array, *, out: Frame | None = None) -> Frame:
         """The frame of one robot's camera, with intrinsics (3, 3); into fresh arrays, or into those of `out`.
@@ -141,40 +209,94 @@ class Rasterizer:
     ) -> Frame:
         """Like `render_view`, from the arrays of a snapshot."""
         frame = Frame.empty(self.width, self.height) if out is None else self._checked(out)
-        needed = render_kernel(
-            *self._geometry,
-            _contiguous(body_mesh, np.int64),
-            _contiguous(body_poses, np.float64),
-            _contiguous(body_tints, np.float64),
-            _contiguous(body_object, np.int64),
-            hidden_object,
-            _camera_row(T_world_camera, intrinsics, self.sample_offset, self.near_m),
-            light_row(light),
+        meshes = _contiguous(body_mesh, np.int64)
+        poses = _contiguous(body_poses, np.float64)
+        objects = _contiguous(body_object, np.int64)
+        if not len(meshes) == len(poses) == len(body_tints) == len(objects):
+            counts = (len(meshes), len(poses), len(body_tints), len(objects))
+            raise ValueError(f"there are {counts} body meshes, poses, tints and objects; the counts must agree")
+        camera = _camera_row(T_world_camera, intrinsics, self.sample_offset, self.near_m)
+        lights = light_row(light, self.look.haze_m)
+        status, number = TABLE_FULL, len(self._triangles)
+        while status == TABLE_FULL:
+            status, number = draw_bodies(
+                self._geometry,
+                meshes,
+                poses,
+                _contiguous(body_tints, np.float64),
+                objects,
+                hidden_object,
+                self._shaded,
+                camera,
+                lights,
+                self._projected,
+                self._triangles,
+                self._inverse_depth,
+                self._triangle_at,
+                self._spans,
+            )
+            if status == TABLE_FULL:
+                self._triangles = np.empty((2 * number, TRIANGLE_FIELDS), np.float32)
+        if status == NO_MESH:
+            raise ValueError(f"body_mesh[{number}] is {meshes[number]}, there are {len(self._geometry[0]) - 1} meshes")
+        if status == BAD_POSE:
+            raise ValueError(f"body_poses[{number}] is not finite:\n{poses[number]}")
+        if self._shaded:
+            draw_shadows(
+                self._geometry,
+                meshes,
+                poses,
+                self._look,
+                camera,
+                lights,
+                self._projected,
+                self._shadow,
+                self._contact,
+                self._shadow_spans,
+            )
+        colors = frame.rgb.reshape(self.height, 3 * self.width)
+        draw_background(
+            camera,
+            lights,
+            self._look,
             self._noise,
-            self._projected,
+            self._shadow,
+            self._contact,
+            self._shadow_spans,
+            colors,
+            frame.depth,
+            frame.instances,
+        )
+        draw_foreground(
+            camera[12],
+            lights,
+            self._noise,
             self._triangles,
             self._inverse_depth,
             self._triangle_at,
             self._spans,
-            frame.rgb,
+            self._shadow,
+            self._contact,
+            self._shadow_spans,
+            colors,
             frame.depth,
             frame.instances,
         )
-        if needed > 0:
-            self._triangles = np.empty((2 * needed, TRIANGLE_FIELDS), np.float32)
-            return self.render_bodies(
-                body_mesh,
-                body_poses,
+        if self._fine is not None:
+            scaled = np.array(intrinsics, dtype=np.float64)
+            scaled[:2] *= self.look.samples
+            fine = self._fine.render_bodies(
+                meshes,
+                poses,
                 body_tints,
-                body_object,
+                objects,
                 light,
                 T_world_camera,
-                intrinsics,
+                scaled,
                 hidden_object=hidden_object,
-                out=frame,
+                out=self._fine_frame,
             )
-        if needed < 0:
-            raise ValueError(f"body_mesh refers to mesh {-needed - 1}, there are {len(self._geometry[0]) - 1}")
+            mean_colors(fine.rgb, frame.rgb)
         return frame
 
     def _checked(self, out: Frame) -> Frame:
@@ -221,12 +343,19 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) 
     return T
 
 
-def light_row(light: Light) -> Array:
-    """The light as the kernels take it (14,): sun, ambient, haze 1/m, sky, horizon and ground colours."""
+def light_row(light: Light, haze_m: float) -> Array:
+    """The light as the kernels take it (14,): sun, ambient, haze 1/m, sky, horizon and ground colours.
+
+    Raises:
+        ValueError: a value that is not finite, or out of its range.
+    """
     sun = np.asarray(light.sun_direction, dtype=np.float64)
     sun = sun / max(float(np.linalg.norm(sun)), 1e-12)
     colors = (*light.sky_color, *light.horizon_color, *light.ground_color)
-    return np.array((*sun, light.ambient, 1.0 / HAZE_M, *colors), dtype=np.float64)
+    row = np.array((*sun, light.ambient, 1.0 / haze_m, *colors), dtype=np.float64)
+    if not np.isfinite(row).all() or not 0 <= light.ambient <= 1 or row[5:].min() < 0 or row[5:].max() > 255:
+        raise ValueError(f"the light must be finite, ambient in [0, 1], colours in [0, 255], got {light}")
+    return row
 
 
 def _camera_row(T_world_camera: Array, intrinsics: Array, sample_offset: tuple[float, float], near_m: float) -> Array:
@@ -235,6 +364,8 @@ def _camera_row(T_world_camera: Array, intrinsics: Array, sample_offset: tuple[f
     K = np.asarray(intrinsics, dtype=np.float64)
     if T.shape != (4, 4):
         raise ValueError(f"T_world_camera must have shape (4, 4), got {T.shape}")
+    if not np.isfinite(T).all():
+        raise ValueError(f"T_world_camera must be finite, got\n{T}")
     if K.shape != (3, 3) or not (K[0, 0] > 0 and K[1, 1] > 0 and K[0, 1] == K[1, 0] == 0 and K[2, 2] == 1):
         raise ValueError(f"intrinsics must be a pinhole matrix (3, 3) without skew, got\n{K}")
     row = np.empty(19)
@@ -248,24 +379,43 @@ def _contiguous(array: ArrayLike, dtype: type) -> NDArray[Any]:
     return np.ascontiguousarray(array, dtype=dtype)
 
 
-def _pack(meshes: Sequence[Mesh]) -> tuple[NDArray[Any], ...]:
-    """All meshes end to end: first vertex and face of each, bounding spheres, vertices, faces, planes, colours."""
+def _pack(meshes: Sequence[Mesh], look: Look) -> tuple[NDArray[Any], ...]:
+    """All meshes end to end, as the kernels take them.
+
+    First vertex and face of each mesh, bounding spheres, boxes; vertices; faces, their planes, colours, kinds, corner
+    normals (9), gradients of their second and third corner's weight (6), directions of their pattern (6).
+    """
     for i, m in enumerate(meshes):
         if not np.isfinite(m.vertices).all() or len(m.colors) != len(m.faces):
             raise ValueError(f"mesh {i} has a vertex that is not finite, or not one colour per face")
-    first_vertex = np.cumsum([0, *(len(m.vertices) for m in meshes)]).astype(np.int64)
-    first_face = np.cumsum([0, *(len(m.faces) for m in meshes)]).astype(np.int64)
-    spheres = np.array([_bounding_sphere(m.vertices) for m in meshes]).reshape(-1, 4)
-    planes = [np.column_stack([n := normals(m), np.einsum("ij,ij->i", n, m.vertices[m.faces[:, 0]])]) for m in meshes]
+        if m.patterns is not None and (len(m.patterns) != len(m.faces) or max(m.patterns, default=0) >= len(PATTERNS)):
+            raise ValueError(f"mesh {i} must have one pattern per face, each below {len(PATTERNS)}")
+    surfaces = [_surface(m, look) for m in meshes]
     return (
-        first_vertex,
-        first_face,
-        spheres,
+        np.cumsum([0, *(len(m.vertices) for m in meshes)]).astype(np.int64),
+        np.cumsum([0, *(len(m.faces) for m in meshes)]).astype(np.int64),
+        np.array([_bounding_sphere(m.vertices) for m in meshes]).reshape(-1, 4),
+        np.array([np.concatenate(extent(m)) for m in meshes]).reshape(-1, 6),
         np.vstack([np.zeros((0, 3)), *(m.vertices for m in meshes)]),
         np.vstack([np.zeros((0, 3), np.int32), *(m.faces for m in meshes)]).astype(np.int32),
-        np.vstack([np.zeros((0, 4)), *planes]),
-        np.vstack([np.zeros((0, 3), np.uint8), *(m.colors for m in meshes)]).astype(np.float64),
+        *(np.vstack([np.zeros((0, k)), *(s[i] for s in surfaces)]) for i, k in enumerate((4, 3))),
+        np.concatenate([np.zeros(0, np.uint8), *(s[2] for s in surfaces)]),
+        *(np.vstack([np.zeros((0, k)), *(s[i] for s in surfaces)]) for i, k in ((3, 9), (4, 6), (5, 6))),
     )
+
+
+def _surface(m: Mesh, look: Look) -> tuple[NDArray[Any], ...]:
+    """Planes (f, 4), colours (f, 3), kinds (f,), corner normals (f, 9), gradients (f, 6), pattern axes (f, 6)."""
+    flat, corners = normals(m), corner_normals(m)
+    planes = np.column_stack([flat, np.einsum("ij,ij->i", flat, m.vertices[m.faces[:, 0]])])
+    round_ = (np.abs(corners - flat[:, None]).max((1, 2)) > 1e-3) & look.smooth
+    patterns = m.patterns if m.patterns is not None and look.patterns else np.zeros(len(m.faces), np.uint8)
+    kinds = (SMOOTH * round_ + PATTERNED * (patterns > 0) + (patterns.astype(np.int64) << 4)).astype(np.uint8)
+    e1, e2 = (m.vertices[m.faces[:, k]] - m.vertices[m.faces[:, 0]] for k in (1, 2))
+    d11, d12, d22 = (np.einsum("ij,ij->i", a, b)[:, None] for a, b in ((e1, e1), (e1, e2), (e2, e2)))
+    area = np.maximum(d11 * d22 - d12**2, 1e-18)
+    duals = np.column_stack([(d22 * e1 - d12 * e2) / area, (d11 * e2 - d12 * e1) / area])
+    return planes, m.colors.astype(np.float64), kinds, corners.reshape(-1, 9), duals, pattern_axes(flat)
 
 
 def _bounding_sphere(vertices: Array) -> Array:

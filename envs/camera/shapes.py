@@ -13,12 +13,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...matching.pose import rotation_from_vector
 from ..worlds.world import Array, Mesh
+from ._foreground import PATTERNS
 
 Color = tuple[int, int, int]
 
 WHITE: Color = (255, 255, 255)
 RUBBER: Color = (38, 38, 42)
 STEEL: Color = (150, 152, 158)
+
+CREASE_RAD = np.radians(46.0)
+"""Edges sharper than this stay edges when a mesh is shaded smoothly."""
 
 
 def mesh(vertices: ArrayLike, faces: ArrayLike, color: ArrayLike = WHITE) -> Mesh:
@@ -174,19 +178,25 @@ def merge(*meshes: Mesh) -> Mesh:
         raise ValueError("merge needs at least one mesh")
     offsets = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
     faces = [m.faces + np.int32(o) for m, o in zip(meshes, offsets, strict=True)]
-    return Mesh(np.vstack([m.vertices for m in meshes]), np.vstack(faces), np.vstack([m.colors for m in meshes]))
+    patterns = None
+    if any(m.patterns is not None for m in meshes):
+        patterns = np.concatenate(
+            [np.zeros(len(m.faces), np.uint8) if m.patterns is None else m.patterns for m in meshes]
+        )
+    colors = np.vstack([m.colors for m in meshes])
+    return Mesh(np.vstack([m.vertices for m in meshes]), np.vstack(faces), colors, patterns)
 
 
 def translate(body: Mesh, offset: ArrayLike) -> Mesh:
     """The mesh moved by `offset` (3,) m."""
-    return Mesh(body.vertices + np.asarray(offset, dtype=np.float64), body.faces, body.colors)
+    return Mesh(body.vertices + np.asarray(offset, dtype=np.float64), body.faces, body.colors, body.patterns)
 
 
 def rotate(body: Mesh, axis: ArrayLike, angle: float) -> Mesh:
     """The mesh turned about `axis` (3,) through the origin by `angle` rad, right-handed."""
     direction = np.asarray(axis, dtype=np.float64)
     R = rotation_from_vector(direction / np.linalg.norm(direction) * angle)
-    return Mesh(body.vertices @ R.T, body.faces, body.colors)
+    return Mesh(body.vertices @ R.T, body.faces, body.colors, body.patterns)
 
 
 def scale(body: Mesh, factor: ArrayLike) -> Mesh:
@@ -194,15 +204,26 @@ def scale(body: Mesh, factor: ArrayLike) -> Mesh:
     factors = np.broadcast_to(np.asarray(factor, dtype=np.float64), (3,))
     if not (factors > 0).all():
         raise ValueError(f"factor must be positive, got {factor!r}")
-    return Mesh(body.vertices * factors, body.faces, body.colors)
+    return Mesh(body.vertices * factors, body.faces, body.colors, body.patterns)
 
 
 def paint(body: Mesh, color: ArrayLike, where: Callable[[Array, Array], NDArray[np.bool_]] | None = None) -> Mesh:
     """The mesh with its faces recoloured: all, or those where `where(centres (f, 3), normals (f, 3))` is true."""
     colors = body.colors.copy()
-    chosen = slice(None) if where is None else where(body.vertices[body.faces].mean(1), normals(body))
-    colors[chosen] = _face_colors(color, 1)[0]
-    return Mesh(body.vertices, body.faces, colors)
+    colors[_chosen(body, where)] = _face_colors(color, 1)[0]
+    return Mesh(body.vertices, body.faces, colors, body.patterns)
+
+
+def texture(body: Mesh, pattern: str, where: Callable[[Array, Array], NDArray[np.bool_]] | None = None) -> Mesh:
+    """The mesh with a procedural pattern, one of `PATTERNS`, on all faces or those that `where` chooses as in `paint`.
+
+    A pattern varies the brightness of a face's colour and is measured in metres along the face.
+    """
+    if pattern not in PATTERNS:
+        raise ValueError(f"pattern must be one of {', '.join(PATTERNS)}, got {pattern!r}")
+    patterns = np.zeros(len(body.faces), np.uint8) if body.patterns is None else body.patterns.copy()
+    patterns[_chosen(body, where)] = PATTERNS.index(pattern)
+    return Mesh(body.vertices, body.faces, body.colors, patterns)
 
 
 def normals(body: Mesh) -> Array:
@@ -210,6 +231,33 @@ def normals(body: Mesh) -> Array:
     a, b, c = (body.vertices[body.faces[:, k]] for k in range(3))
     cross = np.cross(b - a, c - a)
     return cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-12)
+
+
+def corner_normals(body: Mesh, crease_rad: float = CREASE_RAD) -> Array:
+    """Unit normals (f, 3, 3) at each face's corners: the mean of the faces there that differ by less than a crease."""
+    flat = normals(body)
+    corners = np.repeat(flat[:, None], 3, axis=1)
+    if not len(flat):
+        return corners
+    _, place = np.unique(np.round(body.vertices, 6), axis=0, return_inverse=True)
+    owner = np.repeat(np.arange(len(flat)), 3)
+    at = place.reshape(-1)[body.faces.ravel()]
+    order = np.argsort(at, kind="stable")
+    for group in np.split(order, np.flatnonzero(np.diff(at[order])) + 1):
+        around = flat[owner[group]]
+        near = around @ around.T > np.cos(crease_rad)
+        mean = near @ around
+        corners[owner[group], group % 3] = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
+    return corners
+
+
+def pattern_axes(flat: Array) -> Array:
+    """Directions (f, 6) in which a face with normal (f, 3) measures its pattern: level, and up its slope."""
+    level = np.column_stack([-flat[:, 1], flat[:, 0], np.zeros(len(flat))])
+    lying = np.abs(flat[:, 2]) > 0.99
+    level[lying] = (1.0, 0.0, 0.0)
+    level /= np.linalg.norm(level, axis=1, keepdims=True)
+    return np.column_stack([level, np.cross(flat, level)])
 
 
 def extent(body: Mesh) -> tuple[Array, Array]:
@@ -221,6 +269,10 @@ def volume(body: Mesh) -> float:
     """Enclosed volume in m^3; positive exactly when a closed mesh's faces run counter-clockwise seen from outside."""
     a, b, c = (body.vertices[body.faces[:, k]] for k in range(3))
     return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+
+
+def _chosen(body: Mesh, where: Callable[[Array, Array], NDArray[np.bool_]] | None) -> slice | NDArray[np.bool_]:
+    return slice(None) if where is None else where(body.vertices[body.faces].mean(1), normals(body))
 
 
 def _face_colors(color: ArrayLike, n: int) -> NDArray[np.uint8]:

@@ -38,11 +38,13 @@ class Mesh:
         vertices: (v, 3) m.
         faces: (f, 3) int32 vertex indices, counter-clockwise seen from outside.
         colors: (f, 3) uint8 RGB of each face; multiplied by the body's tint when drawn.
+        patterns: optional (f,) uint8, procedural pattern of each face, an index into `camera.shapes.PATTERNS`.
     """
 
     vertices: Array
     faces: NDArray[np.int32]
     colors: NDArray[np.uint8]
+    patterns: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True, eq=False)

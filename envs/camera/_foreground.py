@@ -1,0 +1,260 @@
+"""Third pass: the bodies' pixels before the background, each shaded once, in Numba.
+
+A face's pattern is a function of two coordinates s (level) and t (up the face) in metres on it; it returns a factor of
+brightness and a shift towards blue. Patterns fade where a pixel covers more than their details.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+SMOOTH, PATTERNED, RECEIVES = 1, 2, 4
+NOISE_SIZE = 128
+FAST = {"contract", "arcp", "nsz"}
+
+PLAIN, GRAIN, LEAVES, WOOD, BRICKS, WINDOWS, STRIPES, CHECKER, RIBS, ASPHALT, TILES = range(11)
+PATTERNS = ("plain", "grain", "leaves", "wood", "bricks", "windows", "stripes", "checker", "ribs", "asphalt", "tiles")
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def draw_foreground(  # type: ignore[no-untyped-def]
+    focal,
+    light,
+    noise,
+    triangles,
+    inverse_depth,
+    triangle_at,
+    spans,
+    shadow,
+    contact,
+    shadow_spans,
+    rgb,
+    depth,
+    instances,
+):
+    """Colour (H, 3 W), depth and instance of the pixels where a body is before the background.
+
+    Leaves `inverse_depth`, `shadow`, `contact` and both `spans` cleared for the next frame.
+    """
+    height, width = inverse_depth.shape
+    f32 = np.float32
+    one, zero = f32(1.0), f32(0.0)
+    haze = f32(light[4])
+    metres = f32(1.0 / focal)
+    far_r, far_g, far_b = f32(light[8]), f32(light[9]), f32(light[10])
+    scratch = np.empty((5, width), np.float32)
+    bright, blue = scratch[0], scratch[1]
+    for row in range(height):
+        c, stop = spans[row, 0], spans[row, 1]
+        while c < stop:
+            iz = inverse_depth[row, c]
+            if iz == zero:
+                c += 1
+                continue
+            # A run of pixels of one triangle: what it needs is looked up once.
+            first = c
+            k = triangle_at[row, c]
+            while c < stop and triangle_at[row, c] == k and inverse_depth[row, c] > zero:
+                c += 1
+            r, g, b = triangles[k, 0], triangles[k, 1], triangles[k, 2]
+            instance = np.int32(triangles[k, 3])
+            rich = triangles[k, 4] > zero
+            if rich:
+                _shade_run(row, first, c, k, metres, triangles, inverse_depth, noise, shadow, contact, scratch)
+            for x in range(first, c):
+                iz = inverse_depth[row, x]
+                inverse_depth[row, x] = zero
+                z = one / iz
+                if z > depth[row, x]:
+                    continue
+                own = iz / (iz + haze)
+                fog = one - own
+                if rich:
+                    own_r = min(r * bright[x] * (one - blue[x]), f32(255.0)) * own
+                    own_g = min(g * bright[x], f32(255.0)) * own
+                    own_b = min(b * bright[x] * (one + blue[x]), f32(255.0)) * own
+                else:
+                    own_r, own_g, own_b = r * own, g * own, b * own
+                rgb[row, 3 * x] = np.uint8(np.int32(own_r + far_r * fog))
+                rgb[row, 3 * x + 1] = np.uint8(np.int32(own_g + far_g * fog))
+                rgb[row, 3 * x + 2] = np.uint8(np.int32(own_b + far_b * fog))
+                depth[row, x] = z
+                instances[row, x] = instance
+        spans[row, 0] = width
+        spans[row, 1] = 0
+    for row in range(height):
+        for c in range(shadow_spans[row, 0], shadow_spans[row, 1]):
+            shadow[row, c] = 0
+            contact[row, c] = 0
+        shadow_spans[row, 0] = width
+        shadow_spans[row, 1] = 0
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _shade_run(row, first, last, k, metres, triangles, inverse_depth, noise, shadow, contact, scratch):  # type: ignore[no-untyped-def]
+    """Brightness and blueness of columns first..last - 1, all of triangle k, into rows 0 and 1 of `scratch`."""
+    f32 = np.float32
+    one, zero = f32(1.0), f32(0.0)
+    bright, blue, s, t, size = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
+    kind = int(triangles[k, 4])
+    v = f32(row)
+    if kind & SMOOTH:
+        step, start, constant = triangles[k, 5], triangles[k, 6] * v + triangles[k, 7], triangles[k, 8]
+        for c in range(first, last):
+            bright[c] = max((step * f32(c) + start) / inverse_depth[row, c] + constant, zero)
+    elif kind & RECEIVES:
+        _receive_run(row, first, last, triangles[k, 5], triangles[k, 6], shadow, contact, bright)
+    else:
+        for c in range(first, last):
+            bright[c] = one
+    for c in range(first, last):
+        blue[c] = zero
+    if kind & PATTERNED:
+        step, start, constant = triangles[k, 9], triangles[k, 10] * v + triangles[k, 11], triangles[k, 12]
+        step_t, start_t, constant_t = triangles[k, 13], triangles[k, 14] * v + triangles[k, 15], triangles[k, 16]
+        for c in range(first, last):
+            z = one / inverse_depth[row, c]
+            s[c] = (step * f32(c) + start) * z + constant
+            t[c] = (step_t * f32(c) + start_t) * z + constant_t
+            size[c] = z * metres
+        _pattern_run(int(triangles[k, 17]), first, last, s, t, size, noise, bright, blue)
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _receive_run(row, first, last, sky, sun, shadow, contact, bright):  # type: ignore[no-untyped-def]
+    """Light from sky and sun on pixels that lie flat on the ground, as `_background` shades the ground itself."""
+    f32 = np.float32
+    height, width = shadow.shape
+    above, below = max(row - 1, 0), min(row + 1, height - 1)
+    for c in range(first, last):
+        left, right = max(c - 1, 0), min(c + 1, width - 1)
+        covered = shadow[row, c] + shadow[row, left] + shadow[row, right] + shadow[above, c] + shadow[below, c]
+        dark = f32(contact[row, c]) * f32(1.0 / 255.0)
+        from_sun = sun * (f32(1.0) - f32(0.19) * f32(covered)) * (f32(1.0) - f32(0.5) * dark)
+        bright[c] = sky * (f32(1.0) - dark) + from_sun
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _pattern_run(pattern, first, last, s, t, size, noise, bright, blue):  # type: ignore[no-untyped-def]
+    """Multiply `bright`, and set `blue`, of columns first..last - 1 at (s, t) m, where a pixel covers `size` m."""
+    f32 = np.float32
+    one, zero, half = f32(1.0), f32(0.0), f32(0.5)
+    if pattern == GRAIN:
+        for c in range(first, last):
+            fine = _detail(f32(0.03), size[c]) * f32(0.12) * _speck(s[c] * f32(45.0), t[c] * f32(45.0), noise)
+            bright[c] *= one + f32(0.1) * _noise(s[c] * f32(7.0), t[c] * f32(7.0), noise) + fine
+    elif pattern == ASPHALT:
+        for c in range(first, last):
+            fine = _detail(f32(0.05), size[c]) * f32(0.14) * _speck(s[c] * f32(30.0), t[c] * f32(30.0), noise)
+            bright[c] *= one + f32(0.1) * _noise(s[c] * f32(2.0), t[c] * f32(2.0), noise) + fine
+    elif pattern == LEAVES:
+        for c in range(first, last):
+            fine = _detail(f32(0.25), size[c]) * f32(0.45) * _noise(s[c] * f32(8.0), t[c] * f32(8.0), noise)
+            bright[c] *= one + f32(0.25) * _noise(s[c] * f32(2.0), t[c] * f32(2.0), noise) + fine
+    elif pattern == WOOD:
+        for c in range(first, last):
+            across = t[c] * f32(1.0 / 0.15)
+            plank = _floor(across)
+            groove = f32(0.35) if across - plank < f32(0.1) else zero
+            grain = _cell(plank, zero, noise) + _noise(s[c] * f32(6.0), t[c] * f32(60.0), noise)
+            bright[c] *= one + _detail(f32(0.15), size[c]) * (f32(0.12) * grain - groove)
+    elif pattern == BRICKS:
+        for c in range(first, last):
+            up = t[c] * f32(5.0)
+            course = _floor(up)
+            across = s[c] * f32(2.0) + half * (course - f32(2.0) * _floor(half * course))
+            brick = _floor(across)
+            mortar = up - course < f32(0.12) or across - brick < f32(0.05)
+            shift = f32(0.22) if mortar else f32(0.14) * _cell(brick, course, noise) - f32(0.03)
+            bright[c] *= one + _detail(f32(0.2), size[c]) * shift
+    elif pattern == WINDOWS:
+        for c in range(first, last):
+            across, up = s[c] * f32(1.0 / 2.4), t[c] * f32(1.0 / 3.0)
+            bay, storey = _floor(across), _floor(up)
+            x, y = across - bay, up - storey
+            if x > f32(0.22) and x < f32(0.78) and y > f32(0.32) and y < f32(0.82):
+                sky = f32(0.5) * max(y - f32(0.55), zero)
+                bright[c] *= f32(0.42) + f32(0.2) * _cell(bay, storey, noise) + sky
+                blue[c] = f32(0.18)
+    elif pattern == STRIPES:
+        for c in range(first, last):
+            along = (s[c] + t[c]) * f32(1.0 / 0.36)
+            bright[c] *= one if along - _floor(along) < half else f32(0.22)
+    elif pattern == CHECKER:
+        for c in range(first, last):
+            odd = half * (_floor(s[c] * f32(4.0)) + _floor(t[c] * f32(4.0)))
+            bright[c] *= one - f32(0.9) * (odd - _floor(odd))
+    elif pattern == RIBS:
+        for c in range(first, last):
+            along = s[c] * f32(1.0 / 0.22)
+            shift = f32(0.16) if along - _floor(along) < f32(0.4) else f32(-0.12)
+            bright[c] *= one + _detail(f32(0.22), size[c]) * shift
+    elif pattern == TILES:
+        for c in range(first, last):
+            x, y = s[c] * f32(1.0 / 0.6), t[c] * f32(1.0 / 0.6)
+            i, j = _floor(x), _floor(y)
+            joint = x - i < f32(0.06) or y - j < f32(0.06)
+            shift = f32(-0.2) if joint else f32(0.09) * _cell(i, j, noise)
+            bright[c] *= one + _detail(f32(0.3), size[c]) * shift
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _floor(x):  # type: ignore[no-untyped-def]
+    """The floor as float32, for |x| < 2^31, without the library call that `np.floor` makes."""
+    whole = np.float32(np.int32(x))
+    return whole - np.float32(1.0) if whole > x else whole
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _detail(size, metres):  # type: ignore[no-untyped-def]
+    """How much of a detail of `size` m is left where a pixel covers `metres`: 1 near, 0 far."""
+    return min(np.float32(1.0), max(np.float32(0.0), np.float32(1.4) - np.float32(1.4) * metres / size))
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _cell(i, j, noise):  # type: ignore[no-untyped-def]
+    """A number in [-1, 1] for each cell (i, j) of a grid."""
+    mask = np.int32(NOISE_SIZE - 1)
+    a, b = np.int32(i), np.int32(j)
+    column, line = a * np.int32(37) + b * np.int32(11), b * np.int32(29) + a * np.int32(7)
+    return noise[np.uint32((column & mask) + np.int32(NOISE_SIZE) * (line & mask))]
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _speck(x, y, noise):  # type: ignore[no-untyped-def]
+    """Noise in [-1, 1] of the cell that (x, y) falls into."""
+    mask, size = np.int32(NOISE_SIZE - 1), np.int32(NOISE_SIZE)
+    i, j = np.int32(_floor(x)) & mask, np.int32(_floor(y)) & mask
+    return noise[np.uint32(i + size * j)]
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _noise(x, y, noise):  # type: ignore[no-untyped-def]
+    """Smooth noise in [-1, 1] at (x, y) cells."""
+    f32 = np.float32
+    mask, size, one = np.int32(NOISE_SIZE - 1), np.int32(NOISE_SIZE), np.int32(1)
+    i, j = _floor(x), _floor(y)
+    s, t = x - i, y - j
+    left, low = np.int32(i) & mask, np.int32(j) & mask
+    right, high = (left + one) & mask, ((low + one) & mask) * size
+    low *= size
+    lower = noise[np.uint32(low + left)] * (f32(1.0) - s) + noise[np.uint32(low + right)] * s
+    upper = noise[np.uint32(high + left)] * (f32(1.0) - s) + noise[np.uint32(high + right)] * s
+    return lower * (f32(1.0) - t) + upper * t
+
+
+@njit(cache=True, error_model="numpy")
+def mean_colors(fine, rgb):  # type: ignore[no-untyped-def]
+    """Colours (H, W, 3) as the means of blocks of pixels of `fine` (s H, s W, 3)."""
+    height, width, _ = rgb.shape
+    samples = fine.shape[0] // height
+    area = samples * samples
+    for row in range(height):
+        for column in range(width):
+            for i in range(3):
+                total = area // 2
+                for a in range(samples):
+                    for b in range(samples):
+                        total += fine[samples * row + a, samples * column + b, i]
+                rgb[row, column, i] = np.uint8(total // area)

@@ -1,0 +1,547 @@
+"""First pass: bodies' triangles into the depth buffer, and their shadows on the ground into two masks, in Numba.
+
+Numba's cache watches one file at a time, so every kernel here calls only kernels of this file.
+"""
+
+from __future__ import annotations
+
+from math import ceil, sqrt
+
+import numpy as np
+from numba import njit
+
+TRIANGLE_FIELDS = 20
+"""A triangle's record: colour (3), object, kind, and by kind: affine maps of the pixel, below."""
+
+SMOOTH, PATTERNED, RECEIVES = 1, 2, 4
+"""Kinds of triangles, added up; 0 is flat and lit evenly. SMOOTH and RECEIVES exclude each other.
+
+SMOOTH: brightness / z - b0 / z is affine in the pixel: fields 5-7, b0 in 8. RECEIVES (shadows): ambient light in 5, sun
+in 6. PATTERNED: coordinates s and t in 9-12 and 13-16, likewise; the pattern in 17.
+"""
+
+OK, TABLE_FULL, NO_MESH, BAD_POSE = 0, 1, 2, 3
+
+SHADOW_RANGE_M = 150.0
+FLAT_M = 0.12
+"""Bodies lower than this (roads, markings, pavements) cast no shadow: they receive it."""
+
+
+@njit(cache=True, error_model="numpy")
+def draw_bodies(  # type: ignore[no-untyped-def]
+    geometry,
+    body_mesh,
+    body_poses,
+    body_tints,
+    body_object,
+    hidden_object,
+    receive,
+    camera,
+    light,
+    projected,
+    triangles,
+    inverse_depth,
+    triangle_at,
+    spans,
+):
+    """Every visible triangle into the two buffers and the table of triangles; returns (status, number).
+
+    `inverse_depth` holds zeros and `spans` (first column drawn, last + 1) of each row (width, 0) beforehand.
+    """
+    first_vertex, first_face, spheres, _, vertices, faces, planes, colors, kinds, normals, duals, tangents = geometry
+    bound = 0
+    for b in range(len(body_mesh)):
+        m = body_mesh[b]
+        if m < 0 or m >= len(first_face) - 1:
+            return NO_MESH, b
+        total = 0.0
+        for i in range(3):
+            for j in range(4):
+                total += abs(body_poses[b, i, j])
+        if not total < 1e12:
+            return BAD_POSE, b
+        bound += 2 * (first_face[m + 1] - first_face[m])
+    if bound > len(triangles):
+        return TABLE_FULL, bound
+    height, width = inverse_depth.shape
+    R_wc = camera[:9].reshape(3, 3)
+    fx, fy, cx, cy = camera[12], camera[13], camera[14], camera[15]
+    offset_u, offset_v, near = camera[16], camera[17], camera[18]
+    sides = _side_planes(fx, fy, cx, cy, width, height)
+    R = np.empty((3, 3))
+    t = np.empty(3)
+    eye = np.empty(3)
+    sun = np.empty(3)
+    up = np.empty(3)
+    polygon = np.empty((4, 2))
+    ambient = light[3]
+    count = 0
+    for b in range(len(body_mesh)):
+        if hidden_object >= 0 and body_object[b] == hidden_object:
+            continue
+        mesh = body_mesh[b]
+        pose = body_poses[b]
+        for i in range(3):
+            for j in range(3):
+                R[i, j] = R_wc[0, i] * pose[0, j] + R_wc[1, i] * pose[1, j] + R_wc[2, i] * pose[2, j]
+            t[i] = (
+                R_wc[0, i] * (pose[0, 3] - camera[9])
+                + R_wc[1, i] * (pose[1, 3] - camera[10])
+                + R_wc[2, i] * (pose[2, 3] - camera[11])
+            )
+        sphere_x, sphere_y, sphere_z, radius = spheres[mesh, 0], spheres[mesh, 1], spheres[mesh, 2], spheres[mesh, 3]
+        if not _in_view(
+            R[0, 0] * sphere_x + R[0, 1] * sphere_y + R[0, 2] * sphere_z + t[0],
+            R[1, 0] * sphere_x + R[1, 1] * sphere_y + R[1, 2] * sphere_z + t[1],
+            R[2, 0] * sphere_x + R[2, 1] * sphere_y + R[2, 2] * sphere_z + t[2],
+            radius,
+            sides,
+            near,
+        ):
+            continue
+        for j in range(3):
+            eye[j] = -(R[0, j] * t[0] + R[1, j] * t[1] + R[2, j] * t[2])
+            sun[j] = pose[0, j] * light[0] + pose[1, j] * light[1] + pose[2, j] * light[2]
+            up[j] = pose[2, j]
+        base = first_vertex[mesh]
+        left, right, top, bottom = float(width), 0.0, float(height), 0.0
+        for k in range(first_vertex[mesh + 1] - base):
+            px, py, pz = vertices[base + k, 0], vertices[base + k, 1], vertices[base + k, 2]
+            x = R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz + t[0]
+            y = R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz + t[1]
+            z = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz + t[2]
+            projected[k, 0] = x
+            projected[k, 1] = y
+            projected[k, 2] = z
+            if z >= near:
+                iz = 1.0 / z
+                u = fx * x * iz + cx - offset_u
+                v = fy * y * iz + cy - offset_v
+                projected[k, 3] = u
+                projected[k, 4] = v
+                left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
+            else:
+                left, right, top, bottom = 0.0, float(width), 0.0, float(height)
+        left, right, top, bottom = max(left, 0.0), min(right, float(width)), max(top, 0.0), min(bottom, float(height))
+        if left >= right or top >= bottom:
+            continue
+        for row in range(int(top), ceil(bottom)):
+            spans[row, 0] = min(spans[row, 0], int(left))
+            spans[row, 1] = max(spans[row, 1], ceil(right))
+        for f in range(first_face[mesh], first_face[mesh + 1]):
+            px, py, pz = planes[f, 0], planes[f, 1], planes[f, 2]
+            # Distance of the eye behind the face; zero for a face without area, which is not drawn either.
+            behind = planes[f, 3] - (px * eye[0] + py * eye[1] + pz * eye[2])
+            if behind >= 0.0:
+                continue
+            corners = _project_face(
+                faces[f, 0], faces[f, 1], faces[f, 2], projected, near, fx, fy, cx, cy, offset_u, offset_v, polygon
+            )
+            if corners == 0:
+                continue
+            # The face's plane n.p = d in the camera frame gives 1/z as an affine function of the pixel.
+            nx = R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz
+            ny = R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz
+            nz = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz
+            scale = 1.0 / behind
+            iz_u = nx * scale / fx
+            iz_v = ny * scale / fy
+            iz_0 = nz * scale + iz_u * (offset_u - cx) + iz_v * (offset_v - cy)
+            drawn = _fill(
+                polygon[0, 0],
+                polygon[0, 1],
+                polygon[1, 0],
+                polygon[1, 1],
+                polygon[2, 0],
+                polygon[2, 1],
+                iz_u,
+                iz_v,
+                iz_0,
+                count,
+                inverse_depth,
+                triangle_at,
+            )
+            if corners == 4:
+                drawn |= _fill(
+                    polygon[0, 0],
+                    polygon[0, 1],
+                    polygon[2, 0],
+                    polygon[2, 1],
+                    polygon[3, 0],
+                    polygon[3, 1],
+                    iz_u,
+                    iz_v,
+                    iz_0,
+                    count,
+                    inverse_depth,
+                    triangle_at,
+                )
+            if not drawn:
+                continue
+            kind = int(kinds[f] & (SMOOTH | PATTERNED))
+            from_sky = _from_sky(px, py, pz, up, ambient)
+            from_sun = (1.0 - ambient) * max(0.0, px * sun[0] + py * sun[1] + pz * sun[2])
+            lit = from_sky + from_sun
+            if kind & SMOOTH:
+                lit = 1.0
+                _record_brightness(
+                    triangles[count],
+                    normals[f],
+                    duals[f],
+                    vertices,
+                    base + faces[f, 0],
+                    up,
+                    sun,
+                    ambient,
+                    R,
+                    eye,
+                    camera,
+                )
+            elif receive and px * up[0] + py * up[1] + pz * up[2] > 0.98:
+                k = base + faces[f, 0]
+                if up[0] * vertices[k, 0] + up[1] * vertices[k, 1] + up[2] * vertices[k, 2] + pose[2, 3] < FLAT_M:
+                    kind |= RECEIVES
+                    lit = 1.0
+                    triangles[count, 5] = from_sky
+                    triangles[count, 6] = from_sun
+            if kind & PATTERNED:
+                s, t_ = tangents[f, :3], tangents[f, 3:6]
+                _record_affine(triangles[count], 9, s[0], s[1], s[2], 0.0, R, eye, camera)
+                _record_affine(triangles[count], 13, t_[0], t_[1], t_[2], 0.0, R, eye, camera)
+                triangles[count, 17] = kinds[f] >> 4
+            for i in range(3):
+                triangles[count, i] = min(255.0, colors[f, i] * body_tints[b, i] * lit)
+            triangles[count, 3] = body_object[b]
+            triangles[count, 4] = kind
+            count += 1
+    return OK, count
+
+
+@njit(cache=True, error_model="numpy")
+def draw_shadows(  # type: ignore[no-untyped-def]
+    geometry, body_mesh, body_poses, look, camera, light, projected, shadow, contact, spans
+):
+    """Shadows that the sun casts on the ground into `shadow` (0 or 1), darkness around feet into `contact` (0 to 255).
+
+    Both hold zeros and `spans` (width, 0) beforehand. A shadow is the mesh itself, flattened along the sun's rays.
+    """
+    first_vertex, first_face, spheres, extents, vertices, faces, planes = geometry[:7]
+    if camera[11] <= 1e-6:
+        return
+    height, width = shadow.shape
+    contact_strength = look[0]
+    fx, fy, cx, cy = camera[12], camera[13], camera[14], camera[15]
+    sides = _side_planes(fx, fy, cx, cy, width, height)
+    polygon = np.empty((4, 2))
+    point = np.empty(3)
+    # A low sun would throw shadows without end.
+    slope_x, slope_y = light[0] / max(light[2], 0.15), light[1] / max(light[2], 0.15)
+    for b in range(len(body_mesh)):
+        mesh = body_mesh[b]
+        pose = body_poses[b]
+        if pose[2, 2] * extents[mesh, 5] + pose[2, 3] < FLAT_M and pose[2, 2] > 0.9:
+            continue
+        distance = sqrt((pose[0, 3] - camera[9]) ** 2 + (pose[1, 3] - camera[10]) ** 2)
+        if distance - spheres[mesh, 3] > SHADOW_RANGE_M:
+            continue
+        if contact_strength > 0.0 and pose[2, 2] > 0.9:
+            _draw_contact(extents[mesh], pose, contact_strength, camera, projected, polygon, contact, spans)
+        if look[1] == 0.0 or light[2] < 0.02 or light[3] > 0.99:
+            continue
+        for i in range(3):
+            point[i] = pose[i, 3]
+            for j in range(3):
+                point[i] += pose[i, j] * spheres[mesh, j]
+        # Half the length of the shadow of a body from the ground to the top of its bounding sphere.
+        rise = 0.5 * max(point[2] + spheres[mesh, 3], 0.0)
+        reach = spheres[mesh, 3] + rise * sqrt(slope_x**2 + slope_y**2)
+        _to_camera(point[0] - slope_x * rise, point[1] - slope_y * rise, 0.0, camera, projected, 0)
+        if not _in_view(projected[0, 0], projected[0, 1], projected[0, 2], reach, sides, camera[18]):
+            continue
+        base = first_vertex[mesh]
+        for k in range(first_vertex[mesh + 1] - base):
+            px, py, pz = vertices[base + k, 0], vertices[base + k, 1], vertices[base + k, 2]
+            z = max(pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3], 0.0)
+            x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3] - slope_x * z
+            y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3] - slope_y * z
+            _to_camera(x, y, 0.0, camera, projected, k)
+        sun_x = pose[0, 0] * light[0] + pose[1, 0] * light[1] + pose[2, 0] * light[2]
+        sun_y = pose[0, 1] * light[0] + pose[1, 1] * light[1] + pose[2, 1] * light[2]
+        sun_z = pose[0, 2] * light[0] + pose[1, 2] * light[1] + pose[2, 2] * light[2]
+        for f in range(first_face[mesh], first_face[mesh + 1]):
+            # The faces towards the sun cover the same shadow as those away from it.
+            if planes[f, 0] * sun_x + planes[f, 1] * sun_y + planes[f, 2] * sun_z <= 0.0:
+                continue
+            corners = _project_face(
+                faces[f, 0],
+                faces[f, 1],
+                faces[f, 2],
+                projected,
+                camera[18],
+                fx,
+                fy,
+                cx,
+                cy,
+                camera[16],
+                camera[17],
+                polygon,
+            )
+            for k in range(corners - 2):
+                _fill_mask(
+                    polygon[0, 0],
+                    polygon[0, 1],
+                    polygon[k + 1, 0],
+                    polygon[k + 1, 1],
+                    polygon[k + 2, 0],
+                    polygon[k + 2, 1],
+                    shadow,
+                    spans,
+                )
+
+
+@njit(cache=True, error_model="numpy")
+def _draw_contact(extent, pose, strength, camera, projected, polygon, contact, spans):  # type: ignore[no-untyped-def]
+    """Darken the ground below a body and a margin about its bounding box."""
+    low, high = pose[2, 3] + extent[2], pose[2, 3] + extent[5]
+    strength *= 1.0 - max(low, 0.0) / 0.3
+    if strength <= 0.0 or low < -1.0:
+        return
+    margin = min(max(0.6 * (high - low), 0.05), 0.7)
+    middle_x, middle_y = 0.5 * (extent[0] + extent[3]), 0.5 * (extent[1] + extent[4])
+    half_x, half_y = 0.5 * (extent[3] - extent[0]), 0.5 * (extent[4] - extent[1])
+    for k in range(4):
+        x = middle_x + (half_x + margin) * (1.0 if k == 1 or k == 2 else -1.0)
+        y = middle_y + (half_y + margin) * (1.0 if k >= 2 else -1.0)
+        _to_camera(
+            pose[0, 0] * x + pose[0, 1] * y + pose[0, 3],
+            pose[1, 0] * x + pose[1, 1] * y + pose[1, 3],
+            0.0,
+            camera,
+            projected,
+            k,
+        )
+    fx, fy, cx, cy = camera[12], camera[13], camera[14], camera[15]
+    # Row of the camera's rotation that gives a world vector along the body's axes, per pixel, times z.
+    maps = np.empty((3, 3))
+    for axis in range(3):
+        if axis < 2:
+            wx, wy, wz = pose[0, axis], pose[1, axis], 0.0
+        else:
+            wx, wy, wz = 0.0, 0.0, -1.0 / camera[11]
+        u = (camera[0] * wx + camera[3] * wy + camera[6] * wz) / fx
+        v = (camera[1] * wx + camera[4] * wy + camera[7] * wz) / fy
+        w = camera[2] * wx + camera[5] * wy + camera[8] * wz
+        maps[axis, 0], maps[axis, 1] = u, v
+        maps[axis, 2] = w + u * (camera[16] - cx) + v * (camera[17] - cy)
+    eye_x = pose[0, 0] * (camera[9] - pose[0, 3]) + pose[1, 0] * (camera[10] - pose[1, 3]) - middle_x
+    eye_y = pose[0, 1] * (camera[9] - pose[0, 3]) + pose[1, 1] * (camera[10] - pose[1, 3]) - middle_y
+    for i in range(2):
+        corners = _project_face(0, i + 1, i + 2, projected, camera[18], fx, fy, cx, cy, camera[16], camera[17], polygon)
+        for k in range(corners - 2):
+            _fill_contact(
+                polygon[0, 0],
+                polygon[0, 1],
+                polygon[k + 1, 0],
+                polygon[k + 1, 1],
+                polygon[k + 2, 0],
+                polygon[k + 2, 1],
+                maps,
+                eye_x,
+                eye_y,
+                half_x,
+                half_y,
+                margin,
+                strength,
+                contact,
+                spans,
+            )
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _to_camera(x, y, z, camera, projected, k):  # type: ignore[no-untyped-def]
+    """Camera coordinates and, beyond the near plane, pixel of a world point into row k of `projected`."""
+    x, y, z = x - camera[9], y - camera[10], z - camera[11]
+    depth = camera[2] * x + camera[5] * y + camera[8] * z
+    right = camera[0] * x + camera[3] * y + camera[6] * z
+    down = camera[1] * x + camera[4] * y + camera[7] * z
+    projected[k, 0] = right
+    projected[k, 1] = down
+    projected[k, 2] = depth
+    if depth >= camera[18]:
+        projected[k, 3] = camera[12] * right / depth + camera[14] - camera[16]
+        projected[k, 4] = camera[13] * down / depth + camera[15] - camera[17]
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _from_sky(nx, ny, nz, up, ambient):  # type: ignore[no-untyped-def]
+    """Light a face gets from sky and ground; the sky gives more than the ground."""
+    return ambient * (0.95 + 0.2 * (nx * up[0] + ny * up[1] + nz * up[2]))
+
+
+@njit(cache=True, error_model="numpy")
+def _record_brightness(record, normals, dual, vertices, first, up, sun, ambient, R, eye, camera):  # type: ignore[no-untyped-def]
+    """Brightness of a smooth face, linear between its corners, into fields 5-8 of its record."""
+    b0 = _brightness(normals[0], normals[1], normals[2], up, sun, ambient)
+    b1 = _brightness(normals[3], normals[4], normals[5], up, sun, ambient) - b0
+    b2 = _brightness(normals[6], normals[7], normals[8], up, sun, ambient) - b0
+    gx = b1 * dual[0] + b2 * dual[3]
+    gy = b1 * dual[1] + b2 * dual[4]
+    gz = b1 * dual[2] + b2 * dual[5]
+    b0 -= gx * vertices[first, 0] + gy * vertices[first, 1] + gz * vertices[first, 2]
+    _record_affine(record, 5, gx, gy, gz, b0, R, eye, camera)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _brightness(nx, ny, nz, up, sun, ambient):  # type: ignore[no-untyped-def]
+    return _from_sky(nx, ny, nz, up, ambient) + (1.0 - ambient) * max(0.0, nx * sun[0] + ny * sun[1] + nz * sun[2])
+
+
+@njit(cache=True, error_model="numpy")
+def _record_affine(record, at, gx, gy, gz, constant, R, eye, camera):  # type: ignore[no-untyped-def]
+    """Fields at..at + 3 so that g.p + constant of a body point p is z (f0 column + f1 row + f2) + f3."""
+    u = (R[0, 0] * gx + R[0, 1] * gy + R[0, 2] * gz) / camera[12]
+    v = (R[1, 0] * gx + R[1, 1] * gy + R[1, 2] * gz) / camera[13]
+    w = R[2, 0] * gx + R[2, 1] * gy + R[2, 2] * gz
+    record[at] = u
+    record[at + 1] = v
+    record[at + 2] = w + u * (camera[16] - camera[14]) + v * (camera[17] - camera[15])
+    record[at + 3] = constant + gx * eye[0] + gy * eye[1] + gz * eye[2]
+
+
+@njit(cache=True, error_model="numpy")
+def _side_planes(fx, fy, cx, cy, width, height):  # type: ignore[no-untyped-def]
+    """Unit inward normals (4, 3) of the planes through the camera and the image's left, right, upper and lower edge."""
+    sides = np.array(
+        [[fx, 0.0, cx], [-fx, 0.0, width - cx], [0.0, fy, cy], [0.0, -fy, height - cy]],
+    )
+    for i in range(4):
+        sides[i] /= sqrt(sides[i, 0] ** 2 + sides[i, 1] ** 2 + sides[i, 2] ** 2)
+    return sides
+
+
+@njit(cache=True, error_model="numpy")
+def _in_view(x, y, z, radius, sides, near):  # type: ignore[no-untyped-def]
+    """Whether a ball about (x, y, z) of the camera frame may reach into the picture."""
+    inside = z + radius >= near
+    for i in range(4):
+        inside &= sides[i, 0] * x + sides[i, 1] * y + sides[i, 2] * z >= -radius
+    return inside
+
+
+@njit(cache=True, error_model="numpy")
+def _project_face(i, j, k, projected, near, fx, fy, cx, cy, offset_u, offset_v, polygon):  # type: ignore[no-untyped-def]
+    """Put the corners (u, v) of face (i, j, k), cut at the near plane, into `polygon`; returns how many: 0, 3 or 4."""
+    in_i, in_j, in_k = projected[i, 2] >= near, projected[j, 2] >= near, projected[k, 2] >= near
+    if in_i and in_j and in_k:
+        polygon[0, 0], polygon[0, 1] = projected[i, 3], projected[i, 4]
+        polygon[1, 0], polygon[1, 1] = projected[j, 3], projected[j, 4]
+        polygon[2, 0], polygon[2, 1] = projected[k, 3], projected[k, 4]
+        return 3
+    if not (in_i or in_j or in_k):
+        return 0
+    n = 0
+    for a, b in ((i, j), (j, k), (k, i)):
+        in_a, in_b = projected[a, 2] >= near, projected[b, 2] >= near
+        if in_a:
+            polygon[n, 0], polygon[n, 1] = projected[a, 3], projected[a, 4]
+            n += 1
+        if in_a != in_b:
+            # From the inner to the outer corner, so that two faces cut their common edge at the very same point.
+            p, q = (a, b) if in_a else (b, a)
+            s = (near - projected[p, 2]) / (projected[q, 2] - projected[p, 2])
+            x = projected[p, 0] + s * (projected[q, 0] - projected[p, 0])
+            y = projected[p, 1] + s * (projected[q, 1] - projected[p, 1])
+            polygon[n, 0] = fx * x / near + cx - offset_u
+            polygon[n, 1] = fy * y / near + cy - offset_v
+            n += 1
+    return n
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _edges(x0, y0, x1, y1, x2, y2, width, height):  # type: ignore[no-untyped-def]
+    """Corners from top to bottom, slopes du/dv of the long, upper and lower edge, first and last + 1 row."""
+    if y1 < y0:
+        x0, y0, x1, y1 = x1, y1, x0, y0
+    if y2 < y0:
+        x0, y0, x2, y2 = x2, y2, x0, y0
+    if y2 < y1:
+        x1, y1, x2, y2 = x2, y2, x1, y1
+    low, high = max(min(x0, min(x1, x2)), -1.0), min(max(x0, max(x1, x2)), float(width))
+    first, last = ceil(max(min(y0, float(height)), 0.0)), ceil(max(min(y2, float(height)), 0.0))
+    if low > width - 1 or ceil(low) >= ceil(high):
+        last = first
+    long_slope = (x2 - x0) / (y2 - y0) if y2 > y0 else 0.0
+    upper_slope = (x1 - x0) / (y1 - y0) if y1 > y0 else 0.0
+    lower_slope = (x2 - x1) / (y2 - y1) if y2 > y1 else 0.0
+    return x0, y0, x1, y1, long_slope, upper_slope, lower_slope, first, last
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _columns(row, x0, y0, x1, y1, long_slope, upper_slope, lower_slope, width):  # type: ignore[no-untyped-def]
+    """First and last + 1 column of a row of a triangle as `_edges` gives it.
+
+    A pixel belongs to it if left <= u < right and top <= v < bottom, with each edge evaluated from its upper end:
+    triangles that share an edge leave no gap and never draw a pixel twice.
+    """
+    xa = x0 + (row - y0) * long_slope
+    xb = x0 + (row - y0) * upper_slope if row < y1 else x1 + (row - y1) * lower_slope
+    if xb < xa:
+        xa, xb = xb, xa
+    return ceil(max(min(xa, float(width)), 0.0)), ceil(max(min(xb, float(width)), 0.0))
+
+
+@njit(cache=True, error_model="numpy")
+def _fill(x0, y0, x1, y1, x2, y2, iz_u, iz_v, iz_0, number, inverse_depth, triangle_at):  # type: ignore[no-untyped-def]
+    """Fill a triangle whose sample points lie at whole numbers; returns whether any pixel was drawn."""
+    height, width = inverse_depth.shape
+    x0, y0, x1, y1, long_slope, upper, lower, first, last = _edges(x0, y0, x1, y1, x2, y2, width, height)
+    drawn = False
+    for row in range(first, last):
+        left, right = _columns(row, x0, y0, x1, y1, long_slope, upper, lower, width)
+        base = iz_0 + iz_v * row
+        for column in range(left, right):
+            iz = np.float32(base + iz_u * column)
+            if iz > inverse_depth[row, column]:
+                inverse_depth[row, column] = iz
+                triangle_at[row, column] = number
+                drawn = True
+    return drawn
+
+
+@njit(cache=True, error_model="numpy")
+def _fill_mask(x0, y0, x1, y1, x2, y2, mask, spans):  # type: ignore[no-untyped-def]
+    """Set the pixels of a triangle to 1."""
+    height, width = mask.shape
+    x0, y0, x1, y1, long_slope, upper, lower, first, last = _edges(x0, y0, x1, y1, x2, y2, width, height)
+    for row in range(first, last):
+        left, right = _columns(row, x0, y0, x1, y1, long_slope, upper, lower, width)
+        if left < right:
+            spans[row, 0] = min(spans[row, 0], left)
+            spans[row, 1] = max(spans[row, 1], right)
+        for column in range(left, right):
+            mask[row, column] = 1
+
+
+@njit(cache=True, error_model="numpy")
+def _fill_contact(  # type: ignore[no-untyped-def]
+    x0, y0, x1, y1, x2, y2, maps, eye_x, eye_y, half_x, half_y, margin, strength, contact, spans
+):
+    """Darken the pixels of a triangle on the ground by their distance from the rectangle of these half sides."""
+    height, width = contact.shape
+    x0, y0, x1, y1, long_slope, upper, lower, first, last = _edges(x0, y0, x1, y1, x2, y2, width, height)
+    for row in range(first, last):
+        left, right = _columns(row, x0, y0, x1, y1, long_slope, upper, lower, width)
+        if left < right:
+            spans[row, 0] = min(spans[row, 0], left)
+            spans[row, 1] = max(spans[row, 1], right)
+        for column in range(left, right):
+            iz = maps[2, 0] * column + maps[2, 1] * row + maps[2, 2]
+            if iz <= 0.0:
+                continue
+            x = (maps[0, 0] * column + maps[0, 1] * row + maps[0, 2]) / iz + eye_x
+            y = (maps[1, 0] * column + maps[1, 1] * row + maps[1, 2]) / iz + eye_y
+            away = sqrt(max(abs(x) - half_x, 0.0) ** 2 + max(abs(y) - half_y, 0.0) ** 2)
+            dark = max(0.0, 1.0 - away / margin)
+            value = np.uint8(255.0 * strength * dark * dark)
+            if value > contact[row, column]:
+                contact[row, column] = value
