@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import numpy as np
@@ -9,11 +10,14 @@ from gymnasium import spaces
 from pettingzoo.utils import BaseParallelWrapper
 
 from ..envs.claims import claims_to_action
+from ..envs.seeding import EpisodeSeeds, Seed
 from .localizer import Localizer
 
 
 class LocalizeWrapper(BaseParallelWrapper):
     """Actions shrink to `control` (a Box); the localizer's claims about the last observation go with them.
+
+    What is random in the localizer's eyes and matcher is seeded with the episodes: same seed, same episode.
 
     Args:
         env: a `CollaborativeEnv`, with the sensors that the localizer's perceptor reads.
@@ -29,25 +33,64 @@ class LocalizeWrapper(BaseParallelWrapper):
         if localizer.max_detections != slots:
             raise ValueError(f"the localizer has {localizer.max_detections} slots, the environment {slots}")
         self.localizer = localizer
-        self._control_spaces = {a: self._control_space(env.action_space(a)) for a in env.possible_agents}
-
-    @staticmethod
-    def _control_space(space: spaces.Dict) -> spaces.Space:
-        return space["control"]
+        self._control_spaces = {a: env.action_space(a)["control"] for a in env.possible_agents}
+        self._seeds = EpisodeSeeds.start(None)
+        self._rng: np.random.Generator | None = None
+        self._observations: dict[str, Any] = {}
 
     def action_space(self, agent: str) -> spaces.Space:
         return self._control_spaces[agent]
 
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+    def reset(self, seed: Seed | None = None, options: dict[str, Any] | None = None) -> Any:
+        """Like the environment's; `options={"state": saved}` takes a state of this wrapper's `save_state`."""
+        if options and "state" in options:
+            if seed is not None:
+                raise ValueError(f"a saved state goes on with its own random numbers: seed must be None, got {seed!r}")
+            return self.restore_state(options["state"])
         observations, infos = self.env.reset(seed=seed, options=options)
-        self._rng = np.random.default_rng(seed)
+        if seed is not None:
+            self._seeds = EpisodeSeeds.start(seed)
+        episode, self._seeds = self._seeds.next()
+        # The environment spawns from the episode's seed itself: a key of our own keeps the two streams apart.
+        self._rng = np.random.default_rng(np.random.SeedSequence(episode.entropy, spawn_key=(*episode.spawn_key, _KEY)))
         self._observations = observations
         return observations, infos
 
     def step(self, actions: dict[str, Any]) -> Any:
+        """Localize on the last observation, claim that, and move.
+
+        Raises:
+            ValueError: a control is missing or does not fit; the message names the agent.
+            RuntimeError: before the first reset, or the episode is over.
+        """
         agents = list(self.env.agents)
+        if self._rng is None or not agents:
+            return self.env.step(actions)  # which says what is wrong
+        missing = [a for a in agents if a not in actions]
+        if missing:
+            raise ValueError(f"{missing[0]}: no action given")
         claims = self.localizer.localize([self._observations[a] for a in agents], self._rng)
         full = {a: claims_to_action(c, actions[a]) for a, c in zip(agents, claims, strict=True)}
         result = self.env.step(full)
         self._observations = result[0]
         return result
+
+    def save_state(self) -> Any:
+        """The environment's state and the localizer's random numbers; see `CollaborativeEnv.save_state`."""
+        return self.env.save_state(), copy.deepcopy(self._rng), self._seeds
+
+    def restore_state(self, saved: Any) -> Any:
+        """Go back to a state of `save_state`; returns observations and infos as they were returned then.
+
+        Raises:
+            ValueError: not a state that this wrapper saved.
+        """
+        if not (isinstance(saved, tuple) and len(saved) == 3):
+            raise ValueError(f"a state from this wrapper's save_state() is needed, got {type(saved).__name__}")
+        state, rng, self._seeds = saved
+        observations, infos = self.env.restore_state(state)
+        self._rng, self._observations = copy.deepcopy(rng), observations
+        return observations, infos
+
+
+_KEY = 101
