@@ -70,7 +70,8 @@ class LocalizeWrapper(BaseParallelWrapper):
         if missing:
             raise ValueError(f"{missing[0]}: no action given")
         claims = self.localizer.localize([self._observations[a] for a in agents], self._rng)
-        full = {a: claims_to_action(c, actions[a]) for a, c in zip(agents, claims, strict=True)}
+        # The control goes through as it came: the environment says what is wrong with it.
+        full = {a: claims_to_action(c, ()) | {"control": actions[a]} for a, c in zip(agents, claims, strict=True)}
         result = self.env.step(full)
         self._observations = result[0]
         return result

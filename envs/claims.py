@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 POSITION_BOUND_M = 1000.0
 VARIANCE_BOUND_M2 = 1e6
@@ -55,7 +55,7 @@ class Claims:
         return (self.boxes[:, 2] > self.boxes[:, 0]) & (self.boxes[:, 3] > self.boxes[:, 1])
 
 
-def claims_to_action(claims: Claims, control: NDArray[Any]) -> dict[str, NDArray[Any]]:
+def claims_to_action(claims: Claims, control: ArrayLike) -> dict[str, NDArray[Any]]:
     """The action that makes these claims; positions and variances are clipped to the action space's bounds."""
     bound = POSITION_BOUND_M
     return {
