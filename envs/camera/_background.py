@@ -10,7 +10,7 @@ from numba import njit
 NOISE_SIZE = 128
 """Side of the tile of noise, a power of two."""
 
-FINE, COARSE = 24.0, 2.5
+FINE, COARSE = 48.0, 5.0
 """Cells of noise per metre of ground."""
 
 NOISE_SHIFT = 32768.0

@@ -13,6 +13,9 @@ SMOOTH, PATTERNED, RECEIVES = 1, 2, 4
 NOISE_SIZE = 128
 FAST = {"contract", "arcp", "nsz"}
 
+BRIGHT, BLUE, S, T, SIZE = range(5)
+"""Rows of the scratch memory of a row of pixels: brightness, blueness, place in the pattern, metres a pixel covers."""
+
 PLAIN, GRAIN, LEAVES, WOOD, BRICKS, WINDOWS, STRIPES, CHECKER, RIBS, ASPHALT, TILES = range(11)
 PATTERNS = ("plain", "grain", "leaves", "wood", "bricks", "windows", "stripes", "checker", "ribs", "asphalt", "tiles")
 
@@ -44,7 +47,6 @@ def draw_foreground(  # type: ignore[no-untyped-def]
     metres = f32(1.0 / focal)
     far_r, far_g, far_b = f32(light[8]), f32(light[9]), f32(light[10])
     scratch = np.empty((5, width), np.float32)
-    bright, blue = scratch[0], scratch[1]
     for row in range(height):
         c, stop = spans[row, 0], spans[row, 1]
         while c < stop:
@@ -71,9 +73,9 @@ def draw_foreground(  # type: ignore[no-untyped-def]
                 own = iz / (iz + haze)
                 fog = one - own
                 if rich:
-                    own_r = min(r * bright[x] * (one - blue[x]), f32(255.0)) * own
-                    own_g = min(g * bright[x], f32(255.0)) * own
-                    own_b = min(b * bright[x] * (one + blue[x]), f32(255.0)) * own
+                    own_r = min(r * scratch[BRIGHT, x] * (one - scratch[BLUE, x]), f32(255.0)) * own
+                    own_g = min(g * scratch[BRIGHT, x], f32(255.0)) * own
+                    own_b = min(b * scratch[BRIGHT, x] * (one + scratch[BLUE, x]), f32(255.0)) * own
                 else:
                     own_r, own_g, own_b = r * own, g * own, b * own
                 rgb[row, 3 * x] = np.uint8(np.int32(own_r + far_r * fog))
@@ -91,38 +93,37 @@ def draw_foreground(  # type: ignore[no-untyped-def]
         shadow_spans[row, 1] = 0
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy", inline="always")
 def _shade_run(row, first, last, k, metres, triangles, inverse_depth, noise, shadow, contact, scratch):  # type: ignore[no-untyped-def]
-    """Brightness and blueness of columns first..last - 1, all of triangle k, into rows 0 and 1 of `scratch`."""
+    """Brightness and blueness of columns first..last - 1, all of triangle k, into `scratch`."""
     f32 = np.float32
     one, zero = f32(1.0), f32(0.0)
-    bright, blue, s, t, size = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
     kind = int(triangles[k, 4])
     v = f32(row)
     if kind & SMOOTH:
         step, start, constant = triangles[k, 5], triangles[k, 6] * v + triangles[k, 7], triangles[k, 8]
         for c in range(first, last):
-            bright[c] = max((step * f32(c) + start) / inverse_depth[row, c] + constant, zero)
+            scratch[BRIGHT, c] = max((step * f32(c) + start) / inverse_depth[row, c] + constant, zero)
     elif kind & RECEIVES:
-        _receive_run(row, first, last, triangles[k, 5], triangles[k, 6], shadow, contact, bright)
+        _receive_run(row, first, last, triangles[k, 5], triangles[k, 6], shadow, contact, scratch)
     else:
         for c in range(first, last):
-            bright[c] = one
+            scratch[BRIGHT, c] = one
     for c in range(first, last):
-        blue[c] = zero
+        scratch[BLUE, c] = zero
     if kind & PATTERNED:
         step, start, constant = triangles[k, 9], triangles[k, 10] * v + triangles[k, 11], triangles[k, 12]
         step_t, start_t, constant_t = triangles[k, 13], triangles[k, 14] * v + triangles[k, 15], triangles[k, 16]
         for c in range(first, last):
             z = one / inverse_depth[row, c]
-            s[c] = (step * f32(c) + start) * z + constant
-            t[c] = (step_t * f32(c) + start_t) * z + constant_t
-            size[c] = z * metres
-        _pattern_run(int(triangles[k, 17]), first, last, s, t, size, noise, bright, blue)
+            scratch[S, c] = (step * f32(c) + start) * z + constant
+            scratch[T, c] = (step_t * f32(c) + start_t) * z + constant_t
+            scratch[SIZE, c] = z * metres
+        _pattern_run(int(triangles[k, 17]), first, last, noise, scratch)
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
-def _receive_run(row, first, last, sky, sun, shadow, contact, bright):  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy", inline="always")
+def _receive_run(row, first, last, sky, sun, shadow, contact, scratch):  # type: ignore[no-untyped-def]
     """Light from sky and sun on pixels that lie flat on the ground, as `_background` shades the ground itself."""
     f32 = np.float32
     height, width = shadow.shape
@@ -132,71 +133,89 @@ def _receive_run(row, first, last, sky, sun, shadow, contact, bright):  # type: 
         covered = shadow[row, c] + shadow[row, left] + shadow[row, right] + shadow[above, c] + shadow[below, c]
         dark = f32(contact[row, c]) * f32(1.0 / 255.0)
         from_sun = sun * (f32(1.0) - f32(0.19) * f32(covered)) * (f32(1.0) - f32(0.5) * dark)
-        bright[c] = sky * (f32(1.0) - dark) + from_sun
+        scratch[BRIGHT, c] = sky * (f32(1.0) - dark) + from_sun
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
-def _pattern_run(pattern, first, last, s, t, size, noise, bright, blue):  # type: ignore[no-untyped-def]
-    """Multiply `bright`, and set `blue`, of columns first..last - 1 at (s, t) m, where a pixel covers `size` m."""
+@njit(cache=True, error_model="numpy", inline="always")
+def _pattern_run(pattern, first, last, noise, scratch):  # type: ignore[no-untyped-def]
+    """Multiply the brightness, and set the blueness, of columns first..last - 1 in `scratch`."""
     f32 = np.float32
     one, zero, half = f32(1.0), f32(0.0), f32(0.5)
     if pattern == GRAIN:
         for c in range(first, last):
-            fine = _detail(f32(0.03), size[c]) * f32(0.12) * _speck(s[c] * f32(45.0), t[c] * f32(45.0), noise)
-            bright[c] *= one + f32(0.1) * _noise(s[c] * f32(7.0), t[c] * f32(7.0), noise) + fine
+            fine = (
+                _detail(f32(0.03), scratch[SIZE, c])
+                * f32(0.12)
+                * _speck(scratch[S, c] * f32(45.0), scratch[T, c] * f32(45.0), noise)
+            )
+            scratch[BRIGHT, c] *= (
+                one + f32(0.1) * _noise(scratch[S, c] * f32(7.0), scratch[T, c] * f32(7.0), noise) + fine
+            )
     elif pattern == ASPHALT:
         for c in range(first, last):
-            fine = _detail(f32(0.05), size[c]) * f32(0.14) * _speck(s[c] * f32(30.0), t[c] * f32(30.0), noise)
-            bright[c] *= one + f32(0.1) * _noise(s[c] * f32(2.0), t[c] * f32(2.0), noise) + fine
+            fine = (
+                _detail(f32(0.05), scratch[SIZE, c])
+                * f32(0.14)
+                * _speck(scratch[S, c] * f32(30.0), scratch[T, c] * f32(30.0), noise)
+            )
+            scratch[BRIGHT, c] *= (
+                one + f32(0.1) * _noise(scratch[S, c] * f32(2.0), scratch[T, c] * f32(2.0), noise) + fine
+            )
     elif pattern == LEAVES:
         for c in range(first, last):
-            fine = _detail(f32(0.25), size[c]) * f32(0.45) * _noise(s[c] * f32(8.0), t[c] * f32(8.0), noise)
-            bright[c] *= one + f32(0.25) * _noise(s[c] * f32(2.0), t[c] * f32(2.0), noise) + fine
+            fine = (
+                _detail(f32(0.25), scratch[SIZE, c])
+                * f32(0.45)
+                * _noise(scratch[S, c] * f32(8.0), scratch[T, c] * f32(8.0), noise)
+            )
+            scratch[BRIGHT, c] *= (
+                one + f32(0.25) * _noise(scratch[S, c] * f32(2.0), scratch[T, c] * f32(2.0), noise) + fine
+            )
     elif pattern == WOOD:
         for c in range(first, last):
-            across = t[c] * f32(1.0 / 0.15)
+            across = scratch[T, c] * f32(1.0 / 0.15)
             plank = _floor(across)
             groove = f32(0.35) if across - plank < f32(0.1) else zero
-            grain = _cell(plank, zero, noise) + _noise(s[c] * f32(6.0), t[c] * f32(60.0), noise)
-            bright[c] *= one + _detail(f32(0.15), size[c]) * (f32(0.12) * grain - groove)
+            grain = _cell(plank, zero, noise) + _noise(scratch[S, c] * f32(6.0), scratch[T, c] * f32(60.0), noise)
+            scratch[BRIGHT, c] *= one + _detail(f32(0.15), scratch[SIZE, c]) * (f32(0.12) * grain - groove)
     elif pattern == BRICKS:
         for c in range(first, last):
-            up = t[c] * f32(5.0)
+            up = scratch[T, c] * f32(5.0)
             course = _floor(up)
-            across = s[c] * f32(2.0) + half * (course - f32(2.0) * _floor(half * course))
+            across = scratch[S, c] * f32(2.0) + half * (course - f32(2.0) * _floor(half * course))
             brick = _floor(across)
             mortar = up - course < f32(0.12) or across - brick < f32(0.05)
             shift = f32(0.22) if mortar else f32(0.14) * _cell(brick, course, noise) - f32(0.03)
-            bright[c] *= one + _detail(f32(0.2), size[c]) * shift
+            scratch[BRIGHT, c] *= one + _detail(f32(0.2), scratch[SIZE, c]) * shift
     elif pattern == WINDOWS:
         for c in range(first, last):
-            across, up = s[c] * f32(1.0 / 2.4), t[c] * f32(1.0 / 3.0)
+            across, up = scratch[S, c] * f32(1.0 / 2.4), scratch[T, c] * f32(1.0 / 3.0)
             bay, storey = _floor(across), _floor(up)
             x, y = across - bay, up - storey
             if x > f32(0.22) and x < f32(0.78) and y > f32(0.32) and y < f32(0.82):
                 sky = f32(0.5) * max(y - f32(0.55), zero)
-                bright[c] *= f32(0.42) + f32(0.2) * _cell(bay, storey, noise) + sky
-                blue[c] = f32(0.18)
+                scratch[BRIGHT, c] *= f32(0.42) + f32(0.2) * _cell(bay, storey, noise) + sky
+                scratch[BLUE, c] = f32(0.18)
     elif pattern == STRIPES:
         for c in range(first, last):
-            along = (s[c] + t[c]) * f32(1.0 / 0.36)
-            bright[c] *= one if along - _floor(along) < half else f32(0.22)
+            along = (scratch[S, c] + scratch[T, c]) * f32(1.0 / 0.36)
+            scratch[BRIGHT, c] *= one if along - _floor(along) < half else f32(0.22)
     elif pattern == CHECKER:
         for c in range(first, last):
-            odd = half * (_floor(s[c] * f32(4.0)) + _floor(t[c] * f32(4.0)))
-            bright[c] *= one - f32(0.9) * (odd - _floor(odd))
+            odd = half * (_floor(scratch[S, c] * f32(4.0)) + _floor(scratch[T, c] * f32(4.0)))
+            scratch[BRIGHT, c] *= one - f32(0.9) * (odd - _floor(odd))
     elif pattern == RIBS:
         for c in range(first, last):
-            along = s[c] * f32(1.0 / 0.22)
+            along = scratch[S, c] * f32(1.0 / 0.22)
             shift = f32(0.16) if along - _floor(along) < f32(0.4) else f32(-0.12)
-            bright[c] *= one + _detail(f32(0.22), size[c]) * shift
+            scratch[BRIGHT, c] *= one + _detail(f32(0.22), scratch[SIZE, c]) * shift
     elif pattern == TILES:
         for c in range(first, last):
-            x, y = s[c] * f32(1.0 / 0.6), t[c] * f32(1.0 / 0.6)
+            x, y = scratch[S, c] * f32(1.0 / 0.6), scratch[T, c] * f32(1.0 / 0.6)
             i, j = _floor(x), _floor(y)
             joint = x - i < f32(0.06) or y - j < f32(0.06)
             shift = f32(-0.2) if joint else f32(0.09) * _cell(i, j, noise)
-            bright[c] *= one + _detail(f32(0.3), size[c]) * shift
+            scratch[BRIGHT, c] *= one + _detail(f32(0.3), scratch[SIZE, c]) * shift
 
 
 @njit(cache=True, error_model="numpy", inline="always")
