@@ -9,13 +9,14 @@ from ..camera import shapes
 from .world import Array, Mesh, ObjectClass
 
 ROBOT_CLASSES = (
-    ObjectClass("husky", 0.35),
-    ObjectClass("rover", 0.4),
-    ObjectClass("carrier", 0.5),
-    ObjectClass("drone", 0.2),
-    ObjectClass("crate", 0.45),
+    ObjectClass("husky", 0.2),
+    ObjectClass("rover", 0.2),
+    ObjectClass("carrier", 0.3),
+    ObjectClass("drone", 0.1),
+    ObjectClass("crate", 0.4),
 )
-"""What detectors call the objects of all robot scenes; shared, so that one detector serves them all."""
+"""What detectors call the objects of all robot scenes; shared, so that one detector serves them all. Depths at scale 1,
+as measured in the scenes: the visible surface curves towards the middle, so they are less than half of an extent."""
 
 DARK, GREY, LENS = (48, 49, 53), (122, 124, 130), (30, 34, 48)
 WOOD, WOOD_DARK = (190, 150, 100), (140, 104, 66)
@@ -80,7 +81,7 @@ def carrier() -> Mesh:
     """A long flat-bed robot with a load, 1.4 x 0.8 x 0.75 m."""
     parts = [
         shapes.box((1.4, 0.6, 0.16), center=(0, 0, 0.3)),
-        shapes.box((0.8, 0.56, 0.36), WOOD, (-0.2, 0, 0.56)),
+        shapes.texture(shapes.box((0.8, 0.56, 0.36), WOOD, (-0.2, 0, 0.56)), "wood"),
         shapes.box((0.82, 0.58, 0.05), WOOD_DARK, (-0.2, 0, 0.56)),
         shapes.box((0.26, 0.5, 0.28), center=(0.5, 0, 0.52)),
         shapes.box((0.02, 0.42, 0.12), LENS, (0.635, 0, 0.56)),
@@ -104,7 +105,7 @@ def drone() -> Mesh:
 def crate() -> Mesh:
     """A cube of 0.9 m with battens."""
     size = 0.9
-    parts = [shapes.box((size, size, size), center=(0, 0, size / 2))]
+    parts = [shapes.texture(shapes.box((size, size, size), center=(0, 0, size / 2)), "wood")]
     for z in (0.06, size - 0.06):
         parts.append(shapes.box((size + 0.03, size + 0.03, 0.1), (205, 195, 180), (0, 0, z)))
     return shapes.merge(*parts)
@@ -113,27 +114,29 @@ def crate() -> Mesh:
 def container() -> Mesh:
     """A box of 2.4 x 1.2 x 1.3 m with ribs: hides whatever stands behind it."""
     ribs = [shapes.box((0.08, 1.24, 1.3), (200, 200, 200), (x, 0, 0.65)) for x in (-1.1, -0.37, 0.37, 1.1)]
-    return shapes.merge(shapes.box((2.4, 1.2, 1.3), center=(0, 0, 0.65)), *ribs)
+    sides = shapes.texture(shapes.box((2.4, 1.2, 1.3), center=(0, 0, 0.65)), "ribs")
+    return shapes.merge(sides, *ribs)
 
 
 def barrier() -> Mesh:
     """A road barrier, 2 x 0.5 x 0.85 m."""
     outline = [(-0.25, 0.0), (0.25, 0.0), (0.1, 0.85), (-0.1, 0.85)]
-    return shapes.rotate(shapes.side_profile(outline, 2.0), (0, 0, 1), 1.5707963267948966)
+    body = shapes.rotate(shapes.side_profile(outline, 2.0), (0, 0, 1), 1.5707963267948966)
+    return shapes.texture(body, "grain")
 
 
 def tree() -> Mesh:
     """A tree of 5 m."""
     return shapes.merge(
         shapes.cylinder(0.16, 2.0, BARK, sides=6, center=(0, 0, 1.0)),
-        shapes.sphere((1.3, 1.3, 1.6), LEAF, rings=5, sides=8, center=(0, 0, 3.4)),
+        shapes.texture(shapes.sphere((1.3, 1.3, 1.6), LEAF, rings=5, sides=8, center=(0, 0, 3.4)), "leaves"),
     )
 
 
 def wall() -> Mesh:
     """A panel of 2.5 x 0.1 x 2.2 m with a dark skirting."""
     return shapes.merge(
-        shapes.box((2.5, 0.1, 2.2), center=(0, 0, 1.1)),
+        shapes.texture(shapes.box((2.5, 0.1, 2.2), center=(0, 0, 1.1)), "grain"),
         shapes.box((2.5, 0.14, 0.12), DARK, (0, 0, 0.06)),
         shapes.box((0.06, 0.12, 2.2), (190, 190, 190), (1.22, 0, 1.1)),
     )
@@ -145,4 +148,6 @@ def shed() -> Mesh:
     roof = shapes.rotate(shapes.side_profile(gable, 8.4, (120, 84, 76)), (0, 0, 1), 1.5707963267948966)
     door = shapes.box((1.8, 0.1, 2.2), (96, 100, 108), (0.5, -2.5, 1.1))
     windows = [shapes.box((0.9, 0.1, 0.8), (88, 108, 126), (x, -2.5, 1.9)) for x in (-2.6, 2.8)]
-    return shapes.merge(shapes.box((8, 5, 3), center=(0, 0, 1.5)), shapes.translate(roof, (0, 0, 3)), door, *windows)
+    house = shapes.texture(shapes.box((8, 5, 3), center=(0, 0, 1.5)), "bricks")
+    tiles = shapes.texture(shapes.translate(roof, (0, 0, 3)), "tiles")
+    return shapes.merge(house, tiles, door, *windows)

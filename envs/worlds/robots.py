@@ -22,7 +22,7 @@ from .lighting import check_times, sample_light
 from .models import ROBOT_CLASSES, Model, models
 from .team import TeamRoutes, advance_waypoints, draw_routes, team_commands
 from .wheels import WheelDynamics
-from .world import Array, Light, SceneGenerationError, Snapshot
+from .world import Array, Light, ObjectClass, SceneGenerationError, Snapshot
 
 Range = tuple[float, float]
 
@@ -186,7 +186,6 @@ class RobotWorld:
     Columns of `robot_state`: m/s forward, rad/s to the left.
     """
 
-    classes = ROBOT_CLASSES
     control_size = 2
     state_size = 2
     ends_on_collision = False
@@ -198,6 +197,7 @@ class RobotWorld:
         self.params = params
         self.n_robots = _checked_observers(n_observers, params)
         self.models: tuple[Model, ...] = models(params.scale)
+        self.classes = tuple(ObjectClass(c.name, params.scale * c.depth_to_centre_m) for c in ROBOT_CLASSES)
         self.meshes = tuple(model.mesh for model in self.models)
         self.step_seconds = params.step_seconds
         self.horizontal_fov_rad = np.full(self.n_robots, math.radians(params.horizontal_fov_deg))
