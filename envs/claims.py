@@ -123,7 +123,7 @@ def _leaf(agent: str, name: str, action: Mapping[str, Any], space: spaces.Space)
         raise ValueError(f"{agent}: leaf {name!r} must have shape {space.shape}, got {value.shape}")
     if value.size == 0:
         return value.astype(np.int64 if discrete else np.float64)
-    low, high = (0, space.nvec[0] - 1) if discrete else (space.low, space.high)  # type: ignore[attr-defined]
+    low, high = (0, space.nvec[0] - 1) if discrete else (space.low, space.high)
     if (value >= low).all() and (value <= high).all():
         return value.astype(np.int64 if discrete else np.float64)
     if not discrete and np.isnan(value).any():
