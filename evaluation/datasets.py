@@ -142,7 +142,8 @@ class Dataset:
         order = stream.permutation(len(stored))
         at = stored[order]
         pose = _row(robots["pose"], row, (4, 4))
-        up = meta["up"]
+        own_up = _row(robots["up"], row, (3,))
+        up = meta["up"] if own_up is None else own_up
         intrinsics = _row(robots["intrinsics"], row, (3, 3))
         graph = ObjectGraph(
             positions=detections["position"][at],
@@ -293,7 +294,7 @@ def _read_robots(file: Path) -> dict[str, Any]:
         "time": _scalars(table, "time", file, np.float64, nullable=True),
         "episode": _scalars(table, "episode", file, np.int64),
     }
-    for name, width in (("pose", 16), ("pose_truth", 16), ("odometry", 16), ("intrinsics", 9)):
+    for name, width in (("pose", 16), ("pose_truth", 16), ("odometry", 16), ("intrinsics", 9), ("up", 3)):
         out[name] = _lists(table, name, file, width, nullable=True)
     for name in ("pose", "pose_truth", "odometry"):
         _check_poses(out[name], name, file)

@@ -6,7 +6,7 @@ each robot's eyes look once per step. Claims are scored by the environment's own
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..agents.controllers import scripted_controls
 from ..agents.localizer import Matchings, View, claims, look, relative_pose
-from ..agents.perception import make_perceptor
+from ..agents.perception import Perceptor, make_perceptor
 from ..envs.claims import Claims, claims_to_action
 from ..envs.collaborative import CollaborativeEnv
 from ..envs.scenes import parallel_env
@@ -66,19 +66,29 @@ def play(env: CollaborativeEnv, episode: int, methods: Sequence[Method], setting
     observations, _ = env.reset(seed=[settings.seed, episode])
     step = 0
     while env.agents:
-        stream = (settings.seed, episode, step)
-        eyes = np.random.default_rng(stream).spawn(len(env.agents))
-        views = [
-            look(perceive, observations[agent], env.max_detections, rng)
-            for agent, rng in zip(env.agents, eyes, strict=True)
-        ]
-        frame = _match_frame(env, views, methods, settings, episode, step)
-        yield frame
-        controls = scripted_controls(env.world)
-        said = next(iter(frame.claims.values()))
-        actions = {a: claims_to_action(said[i], controls[i]) for i, a in enumerate(env.agents)}
-        observations, *_ = env.step(actions)
+        views = look_around(env, perceive, observations, (settings.seed, episode, step))
+        yield _match_frame(env, views, methods, settings, episode, step)
+        observations = step_scripted(env)
         step += 1
+
+
+def look_around(
+    env: CollaborativeEnv, perceive: Perceptor, observations: Mapping[str, Any], stream: tuple[int, ...]
+) -> list[View]:
+    """What every robot's eyes make of its observation; `stream` seeds them."""
+    eyes = np.random.default_rng(stream).spawn(len(env.agents))
+    return [
+        look(perceive, observations[agent], env.max_detections, rng)
+        for agent, rng in zip(env.agents, eyes, strict=True)
+    ]
+
+
+def step_scripted(env: CollaborativeEnv) -> dict[str, Any]:
+    """Move by the scene's scripted controllers, claiming nothing; the next observations."""
+    controls = scripted_controls(env.world)
+    nothing = Claims.empty(env.max_detections, len(env.agents) - 1)
+    observations, *_ = env.step({a: claims_to_action(nothing, controls[i]) for i, a in enumerate(env.agents)})
+    return observations
 
 
 def _match_frame(

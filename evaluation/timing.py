@@ -1,4 +1,4 @@
-"""Rates measured side by side: two jobs in turn, in one process, on one thread, so that a drifting machine hits both."""
+"""Rates measured side by side: two jobs in turn, in one process, so that a drifting machine hits both."""
 
 from __future__ import annotations
 

@@ -6,6 +6,8 @@ import typer
 
 from .benchmark import benchmark
 from .demo import demo
+from .import_data import app as import_data
+from .record import check, record
 
 app = typer.Typer(
     name="covis",
@@ -16,6 +18,9 @@ app = typer.Typer(
 )
 app.command()(demo)
 app.command()(benchmark)
+app.command()(record)
+app.command()(check)
+app.add_typer(import_data, name="import")
 
 
 def main() -> None:

@@ -34,6 +34,13 @@ class SimulatedPerceptionParams:
         centre_noise: standard deviation of the distance from surface to centre, as a share of the class's typical one.
         pixel_noise: standard deviation of the centre in the image, pixels.
         centre_noise_image: the same from shape and occlusion, as a share of the box's size.
+        hidden_extent: half the width of an object, as a multiple of its class's surface-to-centre distance, where that
+            is more than half of what is visible; the centre of an occluded or cut-off object may lie that far beside
+            the middle of what is visible. It is not drawn: the picture itself makes this error, and the reported
+            covariance allows for it.
+        hidden_occluded: share of that half width that is one sigma, per unit of occlusion.
+        hidden_upright: the same vertically in the image, as a share of what holds sideways.
+        hidden_cut: share of that half width that is one sigma across an edge of the image that cuts an object off.
         box_noise: standard deviation of each edge of the box, as a share of the box's size.
         class_margin: logit by which the true class leads on a large, free object.
         class_noise: standard deviation of each logit; with the margin it makes the confusion.
@@ -50,6 +57,10 @@ class SimulatedPerceptionParams:
     centre_noise: float = 0.3
     pixel_noise: float = 0.7
     centre_noise_image: float = 0.06
+    hidden_extent: float = 2.5
+    hidden_occluded: float = 2.0
+    hidden_upright: float = 0.4
+    hidden_cut: float = 0.7
     box_noise: float = 0.04
     class_margin: float = 5.0
     class_noise: float = 1.2
@@ -104,6 +115,7 @@ class SimulatedPerception:
         box = seen[:, BOX]
         size = np.stack([box[:, 2] - box[:, 0], box[:, 3] - box[:, 1]], axis=1)
 
+        edges = np.array([0, 0, width, height])
         pixel_std = np.sqrt(p.pixel_noise**2 + (p.centre_noise_image * size) ** 2)
         centre = 0.5 * (box[:, :2] + box[:, 2:]) + pixel_std * rng.standard_normal((n, 2))
         ray = rays(centre, K)
@@ -113,6 +125,9 @@ class SimulatedPerception:
         distance = seen[:, DEPTH] * stretch + to_centre
         relative = p.depth_noise + p.depth_noise_occluded * seen[:, OCCLUSION]
         along = (relative * distance) ** 2 + (p.centre_noise * to_centre) ** 2
+        half = np.maximum(p.hidden_extent * to_centre[:, None], 0.5 * size * (distance / K[0, 0])[:, None])
+        hidden = half * self._hidden_share(seen[:, OCCLUSION], box == edges)
+        across = (distance / K[0, 0]) ** 2 * (pixel_std**2).mean(axis=1)
         # The surface-to-centre error is there already: the typical distance is not this object's.
         noisy = np.maximum(distance + relative * distance * rng.standard_normal(n), 0.1)
         positions = ray / stretch[:, None] * noisy[:, None]
@@ -121,25 +136,33 @@ class SimulatedPerception:
         boxes = np.clip(noisy_box, 0, [width, height, width, height])
         attributes = self._attributes(true_class, seen[:, PIXELS], rng)
 
-        along, positions, attributes, boxes, pixel_std = self._add_false_positives(
-            along, positions, attributes, boxes, pixel_std, observation, rng
+        along, across, hidden, positions, attributes, boxes = self._add_false_positives(
+            along, across, hidden, positions, attributes, boxes, observation, rng
         )
         n = len(positions)
-        across = (np.linalg.norm(positions, axis=1) / K[0, 0]) ** 2 * (pixel_std**2).mean(axis=1)
         reported = along * np.exp(p.uncertainty_noise * rng.standard_normal(n))
         variance = (attributes * (1 - attributes)).mean(axis=1)
+        covariances = ray_covariances(positions, reported, across)
+        covariances[:, :2, :2] += (hidden**2)[:, :, None] * np.eye(2)
         graph = ObjectGraph(
             positions=positions,
             attributes=attributes,
             position_variance=reported,
             attribute_variance=variance * np.exp(p.uncertainty_noise * rng.standard_normal(n)),
-            covariances=ray_covariances(positions, reported, across),
+            covariances=covariances,
             up=np.asarray(observation["up"], dtype=np.float64),
             forward=np.array([0.0, 0.0, 1.0]),
             intrinsics=K,
             image_size=(width, height),
         )
         return Detections(graph, boxes)
+
+    def _hidden_share(self, occlusion: Array, cut: NDArray[np.bool_]) -> Array:
+        """Sigma of the centre (n, 2), right and down, in half widths of the object; `cut` (n, 4) tells by which edge."""
+        p = self.params
+        sideways = np.minimum(p.hidden_occluded * occlusion, p.hidden_cut)
+        occluded = np.stack([sideways, p.hidden_upright * sideways], axis=1)
+        return np.where(cut[:, :2] | cut[:, 2:], p.hidden_cut, occluded)
 
     def _attributes(self, true_class: NDArray[np.int64], pixels: Array, rng: np.random.Generator) -> Array:
         """Class distributions (n, c): softmax of noisy logits, less decided the fewer pixels there are."""
@@ -152,16 +175,17 @@ class SimulatedPerception:
     def _add_false_positives(
         self,
         along: Array,
+        across: Array,
+        hidden: Array,
         positions: Array,
         attributes: Array,
         boxes: Array,
-        pixel_std: Array,
         observation: Mapping[str, Any],
         rng: np.random.Generator,
-    ) -> tuple[Array, Array, Array, Array, Array]:
+    ) -> tuple[Array, ...]:
         n = rng.poisson(self.params.false_positives)
         if n == 0 or len(positions) == 0:
-            return along, positions, attributes, boxes, pixel_std
+            return along, across, hidden, positions, attributes, boxes
         # A false positive looks like the true ones in its view: size, distance and confidence come from among them.
         height, width = observation["depth"].shape
         like = rng.integers(0, len(positions), n)
@@ -173,10 +197,11 @@ class SimulatedPerception:
         decided = self._attributes(rng.integers(0, len(self.classes), n), np.full(n, 60.0), rng)
         return (
             np.concatenate([along, along[like]]),
+            np.concatenate([across, across[like]]),
+            np.concatenate([hidden, hidden[like]]),
             np.concatenate([positions, place]),
             np.concatenate([attributes, decided]),
             np.concatenate([boxes, np.concatenate([corner, corner + size], axis=1)]),
-            np.concatenate([pixel_std, pixel_std[like]]),
         )
 
 
