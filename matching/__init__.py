@@ -6,12 +6,18 @@ Every matcher is a function `(source, target, *, prior=None, rng=None, **options
 """
 
 from .bayes import bayes
+from .bcagm import bcagm
+from .clipper import clipper
 from .graph import Hypothesis, Matcher, Matching, ObjectGraph, PriorRequiredError
 from .hungarian import hungarian
+from .icp import icp
+from .mos import mos
 from .pose import RelativePose
 from .registry import METHODS, load_matcher
 from .reid import reid
 from .rgm import rgm
+from .rrwhm import rrwhm
+from .rrwm import rrwm
 
 __all__ = [
     "METHODS",
@@ -22,8 +28,14 @@ __all__ = [
     "PriorRequiredError",
     "RelativePose",
     "bayes",
+    "bcagm",
+    "clipper",
     "hungarian",
+    "icp",
     "load_matcher",
+    "mos",
     "reid",
     "rgm",
+    "rrwhm",
+    "rrwm",
 ]

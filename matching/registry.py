@@ -5,11 +5,18 @@ from __future__ import annotations
 from importlib import import_module
 from importlib.metadata import entry_points
 
+from .adapters import adapter, is_adapter
 from .bayes import bayes
+from .bcagm import bcagm
+from .clipper import clipper
 from .graph import Matcher
 from .hungarian import hungarian
+from .icp import icp
+from .mos import mos
 from .reid import reid
 from .rgm import rgm, rgm_no_covisibility, rgm_no_uncertainty
+from .rrwhm import rrwhm
+from .rrwm import rrwm
 
 METHODS: dict[str, Matcher] = {
     "bayes": bayes,
@@ -18,6 +25,12 @@ METHODS: dict[str, Matcher] = {
     "rgm": rgm,
     "rgm-no-uncertainty": rgm_no_uncertainty,
     "rgm-no-covisibility": rgm_no_covisibility,
+    "rrwm": rrwm,
+    "icp": icp,
+    "bcagm": bcagm,
+    "rrwhm": rrwhm,
+    "mos": mos,
+    "clipper": clipper,
 }
 
 ENTRY_POINT_GROUP = "covis.matchers"
@@ -30,11 +43,18 @@ class UnknownMatcherError(ValueError):
 def load_matcher(name: str) -> Matcher:
     """The matcher called `name`: in METHODS, in the entry-point group `covis.matchers`, or `package.module:callable`.
 
+    `pygm:<solver>` and `kiss-matcher` name matchers of those packages, if installed (`covis.matching.adapters`).
+
     Raises:
         UnknownMatcherError: there is none, or it is not callable; the message lists the known names.
     """
     if name in METHODS:
         return METHODS[name]
+    if is_adapter(name):
+        try:
+            return adapter(name)
+        except (ImportError, ValueError) as error:
+            raise UnknownMatcherError(str(error)) from error
     installed = {point.name: point for point in entry_points(group=ENTRY_POINT_GROUP)}
     if name in installed:
         return _callable(installed[name].load(), name)

@@ -506,7 +506,7 @@ def assign(terms: Terms, table_pi: Array, state: State, active: NDArray[np.bool_
     current = value(state.sums, state.size[0], table_pi)
     for _ in range(10 * n):
         moved, i, ii = best_reassignment(terms, state, table_pi, current + 1e-9)
-        swapped, a, b = best_exchange(terms, state, table_pi, moved)
+        _, a, b = best_exchange(terms, state, table_pi, moved)
         if a >= 0:
             exchange(terms, state, a, b)
         elif i >= 0:

@@ -160,3 +160,48 @@ def _kth_smallest(values: Array, k: int) -> float:
     inside = inside[:found]
     inside.sort()
     return inside[k - before - 1]
+
+
+@njit(cache=True)
+def nearest_triples(c: Array, d: Array, neighbours: int, nine_terms: bool) -> tuple[NDArray[np.int32], Array]:
+    """T of Eq. (3) as a sparse list: candidates (t, 3), each i * n' + i', and distances (t,) of the two triangles.
+
+    Every source triangle is listed with its `neighbours` nearest target triangles (section 3.4), once for i < j < k;
+    the other orders follow by symmetry. c and d are `vertex_cosines`.
+    """
+    n, m = len(c), len(d)
+    radius = triangle_radius(c, d, neighbours, nine_terms)
+    total = 0
+    for emit in range(2):  # count, then write
+        if emit == 1:
+            index = np.empty((total, 3), dtype=np.int32)
+            distance = np.empty(total)
+        at = 0
+        for i in range(n):
+            for j in range(i + 1, n):
+                for k in range(j + 1, n):
+                    for a in range(m):
+                        for b in range(m):
+                            for e in range(m):
+                                if a in (b, e) or b == e:
+                                    continue
+                                far = triangle_distance(c, i, j, k, d, a, b, e, nine_terms)
+                                if far <= radius[i, j, k]:
+                                    if emit == 1:
+                                        index[at, 0], index[at, 1], index[at, 2] = i * m + a, j * m + b, k * m + e
+                                        distance[at] = far
+                                    at += 1
+        total = at
+    return index, distance
+
+
+@njit(cache=True)
+def contract(index: NDArray[np.int32], values: Array, x: Array, y: Array) -> Array:
+    """T contracted with x and y (n n',): the gradient of T(x, y, z) by z, for a symmetric T given once per triple."""
+    out = np.zeros(len(x))
+    for t in range(len(values)):
+        a, b, c, v = index[t, 0], index[t, 1], index[t, 2], values[t]
+        out[a] += v * (x[b] * y[c] + x[c] * y[b])
+        out[b] += v * (x[a] * y[c] + x[c] * y[a])
+        out[c] += v * (x[a] * y[b] + x[b] * y[a])
+    return out

@@ -1,0 +1,89 @@
+"""What the methods that rank candidate matches share: sizes, widths, and reading off an assignment.
+
+A candidate match of source object i and target object i' has the number i * n' + i'.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from .graph import Matching, ObjectGraph
+from .pose import Array
+from .similarity import attribute_similarity, pair_affinity
+from .uncertainty import kronecker_plus, typical
+
+MAX_CANDIDATES = 8100
+"""Most candidates (n n') of a method that holds an affinity for every two of them, half a gigabyte in all."""
+
+
+def check_size(method: str, source: ObjectGraph, target: ObjectGraph, most: int) -> None:
+    """Raises ValueError naming the numbers unless n n' is at most `most`."""
+    if len(source) * len(target) > most:
+        raise ValueError(
+            f"{method} accepts at most {most} candidate matches ({int(most**0.5)} objects a side), "
+            f"got {len(source)} x {len(target)} = {len(source) * len(target)}"
+        )
+
+
+def extent_floor_m2(*distances: Array) -> float:
+    """A variance for graphs that claim to have none: a millionth of the mean squared distance, m^2."""
+    return 1e-6 * max(1e-6, *(float((d**2).mean()) if d.size else 0.0 for d in distances))
+
+
+def distance_variance_m2(
+    source: ObjectGraph, target: ObjectGraph, source_distance: Array, target_distance: Array
+) -> float:
+    """Median of u_i + u'_i' over the candidates, m^2: half the variance of a difference of distances along the rays."""
+    U = kronecker_plus(source.position_variance, target.position_variance)
+    return max(typical(U), extent_floor_m2(source_distance, target_distance))
+
+
+def affinity_matrix(
+    source: ObjectGraph,
+    target: ObjectGraph,
+    source_distance: Array,
+    target_distance: Array,
+    width_m2: float,
+    attribute_weight: float,
+) -> Array:
+    """(n n', n n') D of Eq. (2) scaled by the attribute similarities of both matches; attributes on the diagonal.
+
+    An entry is D_ab (A_a A_b)^attribute_weight; 0 for matches that share an object.
+    """
+    n, m = len(source), len(target)
+    A = attribute_similarity(source.attributes, target.attributes) ** attribute_weight
+    K = pair_affinity(source_distance, target_distance, width_m2)
+    if attribute_weight > 0:
+        K *= A[:, :, None, None]
+        K *= A[None, None]
+    K = K.reshape(n * m, n * m)
+    if attribute_weight > 0:
+        K.flat[:: n * m + 1] = A.ravel()
+    return K
+
+
+def assignment(support: Array, scores: Array | None = None) -> Matching:
+    """The one-to-one matching of largest total `support` (n, n') >= 0; candidates of no support are not matched.
+
+    Scores are `scores` (n, n') in [0, 1], by default the support relative to the largest.
+    """
+    if support.size == 0 or not support.max() > 0:
+        return Matching.empty()
+    rows, cols = linear_sum_assignment(support, maximize=True)
+    kept = support[rows, cols] > 0
+    rows, cols = rows[kept], cols[kept]
+    scores = support / support.max() if scores is None else scores
+    return Matching(np.stack([rows, cols], axis=1), np.clip(scores[rows, cols], 0.0, 1.0))
+
+
+def mean_agreement(K: Array, support: Array, limit: int = 0) -> Matching:
+    """`assignment`, each match scored by its mean affinity K (n n', n n') with the other matches."""
+    matching = assignment(support)
+    if len(matching) < 2:
+        return matching
+    index = matching.pairs[:, 0] * support.shape[1] + matching.pairs[:, 1]
+    among = K[np.ix_(index, index)]
+    np.fill_diagonal(among, 0.0)
+    scores = np.clip(among.sum(axis=1) / (len(index) - 1), 0.0, 1.0)
+    return Matching(matching.pairs, scores)
