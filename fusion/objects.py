@@ -2,7 +2,8 @@
 
 Detections that matchings connect form a group: one object. The measurements of a group are brought into one robot's
 sensor frame and fused. `gain="covariance"` weighs them by full covariances, the relative pose's covariance added to
-the partner's measurement; `gain="paper"` is eq. 20-22 to the letter: isotropic u, poses taken as exact.
+the partner's measurement; `gain="joint"` also lets the matches correct the poses (see `refine`); `gain="paper"` is eq.
+20-22 to the letter: isotropic u, poses taken as exact.
 """
 
 from __future__ import annotations
@@ -14,12 +15,13 @@ from typing import Literal
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from ..matching.graph import Matching, ObjectGraph
 from ..matching.pose import Array, RelativePose
 
-Gain = Literal["covariance", "paper"]
-GAINS: tuple[Gain, ...] = ("covariance", "paper")
+Gain = Literal["covariance", "joint", "paper"]
+GAINS: tuple[Gain, ...] = ("covariance", "joint", "paper")
 
 MAX_ROBOTS = 62
 """A group's robots are a bit mask in one signed integer."""
@@ -139,6 +141,7 @@ def fuse(
     *,
     frame: int = 0,
     gain: Gain = "covariance",
+    gate: float | None = None,
 ) -> FusedObjects:
     """Fused objects of N robots in the sensor frame of robot `frame`.
 
@@ -147,19 +150,32 @@ def fuse(
         poses: (i, j) -> pose of robot j's sensor in robot i's frame; needed between `frame` and its partners, in
             either direction. A partner without one does not contribute.
         matchings: (i, j) -> Matching, or groups made by `group_detections`.
-        gain: "covariance" or "paper".
+        gain: "covariance", "joint" or "paper".
+        gate: share of honest measurements to keep, for example 0.999; what disagrees more with the rest of its group is
+            left out (`used`), so that a robot that is wrong does not drag the estimate. None = keep all.
 
     Returns:
         Every group with a position in the frame; groups seen only by robots of unknown pose are left out.
     """
     _check(graphs, frame, gain)
     groups = matchings if isinstance(matchings, Groups) else group_detections([len(g) for g in graphs], matchings)
+    threshold = _threshold(gate)
+    if gain == "joint":
+        from .refine import refine  # refine builds on this module
+
+        # Poses between partners often rest on the same errors, one world pose per robot: only the frame's own count.
+        partners = [j for j in range(len(graphs)) if j != frame]
+        star = {(frame, j): pose for j in partners if (pose := relative_pose(poses, frame, j)) is not None}
+        return refine(graphs, star, groups, frame=frame, gate=gate).objects
     positions, covariances, located = _in_frame(graphs, poses, frame, gain)
     offsets = np.concatenate([[0], np.cumsum([len(g) for g in graphs])])[:-1]
     used = (groups.members >= 0) & located
     keep = used.any(axis=1)
     used, members = used[keep], groups.members[keep]
     rows = np.where(used, members + offsets, -1)
+    if np.isfinite(threshold):
+        _gate(rows, positions, covariances, threshold)
+        used = rows >= 0
     fused, fused_covariances = _fuse_groups(rows, positions, covariances)
     return FusedObjects(frame, fused, fused_covariances, members, used, groups.scores[keep])
 
@@ -171,9 +187,21 @@ def fuse_own(
     robot: int,
     *,
     gain: Gain = "covariance",
+    gate: float | None = None,
 ) -> OwnObjects:
     """Every detection of `robot`, fused with what its partners measured; arguments as in `fuse`."""
-    return own_objects(graphs, fuse(graphs, poses, matchings, frame=robot, gain=gain), gain=gain)
+    return own_objects(graphs, fuse(graphs, poses, matchings, frame=robot, gain=gain, gate=gate), gain=gain)
+
+
+def agreement(fused: FusedObjects) -> Array:
+    """Share (N,) of each robot's measurements that passed the gate, in groups of two robots or more; NaN without any.
+
+    A robot far below the others is wrong about its pose or its measurements.
+    """
+    shared = (fused.members >= 0) & ((fused.members >= 0).sum(axis=1) > 1)[:, None]
+    counts = shared.sum(axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray((fused.used & shared).sum(axis=0) / counts)
 
 
 def own_objects(graphs: Sequence[ObjectGraph], fused: FusedObjects, *, gain: Gain = "covariance") -> OwnObjects:
@@ -208,9 +236,18 @@ def _check(graphs: Sequence[ObjectGraph], frame: int, gain: str) -> None:
         raise ValueError(f"gain must be one of {', '.join(GAINS)}, got {gain!r}")
 
 
+def _threshold(gate: float | None) -> float:
+    """Squared Mahalanobis distance that a share `gate` of honest differences in three dimensions stays below."""
+    if gate is None:
+        return float("inf")
+    if not 0 < gate < 1:
+        raise ValueError(f"gate must lie in (0, 1), got {gate}")
+    return float(chi2.ppf(gate, 3))
+
+
 def _measured_covariances(graph: ObjectGraph, gain: Gain) -> Array:
     """(n, 3, 3) m^2, sensor frame: full, or the paper's u I."""
-    if gain == "covariance":
+    if gain != "paper":
         return graph.full_covariances(unknown_variance=UNKNOWN_VARIANCE)
     return np.minimum(graph.position_variance, UNKNOWN_VARIANCE)[:, None, None] * np.eye(3)
 
@@ -371,3 +408,45 @@ def _invert_information(A: Array, out: Array) -> None:
     for i in range(3):
         for j in range(3):
             out[i, j] = 0.5 * (inverse[i, j] + inverse[j, i]) * scale
+
+
+@njit(cache=True)
+def _gate(rows: NDArray[np.int64], positions: Array, covariances: Array, threshold: float) -> None:
+    """Set to -1, in place, the members of each group that disagree with its largest consistent core.
+
+    The core is the member that most others agree with (by the threshold on the squared Mahalanobis distance of their
+    difference), and those others; among equals the more precise. Of two that disagree the more precise is kept.
+    """
+    m, N = rows.shape
+    W, S = np.zeros((3, 3)), np.zeros((3, 3))
+    agree = np.zeros((N, N), dtype=np.bool_)
+    for k in range(m):
+        for i in range(N):
+            for j in range(i):
+                a, b = rows[k, i], rows[k, j]
+                agree[i, j] = agree[j, i] = False
+                if a < 0 or b < 0:
+                    continue
+                for x in range(3):
+                    for y in range(3):
+                        S[x, y] = covariances[a, x, y] + covariances[b, x, y]
+                _invert_spd(S, W)
+                squared = 0.0
+                for x in range(3):
+                    for y in range(3):
+                        squared += (positions[a, x] - positions[b, x]) * W[x, y] * (positions[a, y] - positions[b, y])
+                agree[i, j] = agree[j, i] = squared <= threshold
+        core, support, spread = -1, -1, np.inf
+        for i in range(N):
+            d = rows[k, i]
+            if d < 0:
+                continue
+            count = 0
+            for j in range(N):
+                count += agree[i, j]
+            trace = covariances[d, 0, 0] + covariances[d, 1, 1] + covariances[d, 2, 2]
+            if count > support or (count == support and trace < spread):
+                core, support, spread = i, count, trace
+        for i in range(N):
+            if i != core and not agree[core, i]:
+                rows[k, i] = -1

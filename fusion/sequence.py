@@ -1,0 +1,170 @@
+"""Matching over time: what earlier frames say about the relative pose becomes the prior of the next matching."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..matching.graph import Matcher, Matching, ObjectGraph
+from ..matching.pose import Array, RelativePose, invert
+from .posefilter import Choice, PoseFilter, PoseFilterOptions, from_levelled, level_motion, to_levelled
+from .registration import RegistrationError, register
+
+
+@dataclass(frozen=True)
+class PairOptions:
+    """How a pair's matcher is used over time.
+
+    Attributes:
+        filter: of the relative pose.
+        trust: probability of a pose from which it is handed to the matcher as prior.
+        min_registered: matches a matcher without poses must give for one to be estimated.
+    """
+
+    filter: PoseFilterOptions = field(default_factory=PoseFilterOptions)
+    trust: float = 0.5
+    min_registered: int = 4
+
+
+class PairTracker:
+    """State of one pair of robots through one episode.
+
+    Either let it call the matcher, once without and once with the prior:
+
+        tracker.predict(odometry_source, odometry_target)
+        matching = tracker.match(matcher, source, target)
+
+    or only ask for the prior and report what came of it:
+
+        prior = tracker.prior(odometry_source, odometry_target)
+        matching = matcher(source, target, prior=prior)
+        tracker.update(source, target, matching)
+
+    Both robots' graphs need `up`; without, every frame stands alone.
+    """
+
+    def __init__(self, options: PairOptions | None = None) -> None:
+        self.options = options or PairOptions()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: a new episode."""
+        self.filter = PoseFilter(self.options.filter)
+        self._ups: tuple[Array, Array] | None = None
+        self._given: RelativePose | None = None
+        self._motion: tuple[Array | None, Array | None] = (np.eye(4), np.eye(4))
+        self._frames = 1
+        self._fresh = True
+
+    def predict(
+        self, odometry_source: Array | None = None, odometry_target: Array | None = None, frames: int = 1
+    ) -> None:
+        """Carry the belief on by each robot's own motion (4, 4) since the last frame, sensor frames; None = unknown."""
+        self._motion = (odometry_source, odometry_target)
+        self._frames = frames
+        self._fresh = False
+
+    def prior(self, odometry_source: Array | None = None, odometry_target: Array | None = None) -> RelativePose | None:
+        """Prior for this frame, after `predict`; None while no pose is trusted."""
+        self.predict(odometry_source, odometry_target)
+        self._given = None
+        if self._ups is not None:
+            self._carry(*self._ups)
+            best = self.filter.best()
+            if best is not None and best[2] >= self.options.trust:
+                self._given = from_levelled(best[0], best[1], *self._ups)
+        return self._given
+
+    def update(self, source: ObjectGraph, target: ObjectGraph, matching: Matching) -> None:
+        """Take in the matching of this frame, made with or without the prior."""
+        if source.up is None or target.up is None:
+            return
+        self._ups = (source.up, target.up)
+        if self._given is not None:
+            best = int(np.argmax(self.filter.weights))
+            if len(matching) < 2 or matching.scores.mean() < 0.5:
+                # Little is explained by the prior: trust it less, until the matcher is asked without one again.
+                self.filter.weights[best] *= 0.5
+                self.filter.unknown = 1.0 - float(self.filter.weights.sum())
+            elif matching.pose is not None:
+                # The matcher's pose contains the prior already: it replaces the component.
+                mean, covariance = to_levelled(matching.pose, *self._ups)
+                self.filter.means[best], self.filter.covariances[best] = mean, covariance
+            return
+        found = propose(source, target, matching, self.options.min_registered)
+        self._absorb(found)
+
+    def match(
+        self,
+        matcher: Matcher,
+        source: ObjectGraph,
+        target: ObjectGraph,
+        *,
+        rng: np.random.Generator | None = None,
+        **options: Any,
+    ) -> Matching:
+        """This frame's matching, after `predict`."""
+        alone = matcher(source, target, prior=None, rng=rng, **options)
+        if source.up is None or target.up is None:
+            return alone
+        if self._ups is not None and not self._fresh:
+            self._carry(source.up, target.up)
+        self._ups = (source.up, target.up)
+        before = [(m, C) for m, C in zip(self.filter.means, self.filter.covariances, strict=True)]
+        found = propose(source, target, alone, self.options.min_registered)
+        choice = self._absorb(found)
+        if choice.probability < self.options.trust:
+            return alone
+        if choice.component >= 0:
+            mean, covariance = before[choice.component]
+            prior = from_levelled(mean, covariance, *self._ups)
+        elif choice.hypothesis > 0:
+            prior = found[choice.hypothesis][0]
+        else:
+            return alone
+        return matcher(source, target, prior=prior, rng=rng, **options)
+
+    def _carry(self, up_source: Array, up_target: Array) -> None:
+        """Apply the motion announced by `predict`, once."""
+        assert self._ups is not None
+        source, target = self._motion
+        motions = (
+            None if source is None else level_motion(source, self._ups[0], up_source),
+            None if target is None else level_motion(target, self._ups[1], up_target),
+        )
+        for _ in range(self._frames):
+            self.filter.predict(*motions)
+        self._motion = (np.eye(4), np.eye(4))
+
+    def _absorb(self, found: list[tuple[RelativePose, float]]) -> Choice:
+        assert self._ups is not None
+        levelled = [to_levelled(pose, *self._ups) for pose, _ in found]
+        means = np.array([m for m, _ in levelled]).reshape(-1, 4)
+        covariances = np.array([C for _, C in levelled]).reshape(-1, 4, 4)
+        return self.filter.update(means, covariances, np.array([p for _, p in found]))
+
+
+def propose(
+    source: ObjectGraph, target: ObjectGraph, matching: Matching, min_registered: int = 4
+) -> list[tuple[RelativePose, float]]:
+    """Poses a matching stands for, with probabilities, the first most probable: hypotheses, pose, or one registered."""
+    if matching.hypotheses:
+        return [(h.pose, h.probability) for h in matching.hypotheses]
+    if len(matching) == 0:
+        return []
+    probability = float(matching.scores.mean())
+    if matching.pose is not None:
+        return [(matching.pose, probability)]
+    if len(matching) < min_registered:
+        return []
+    try:
+        return [(register(source, target, matching, huber=2.0), 0.5 * probability)]
+    except RegistrationError:
+        return []
+
+
+def relative_motion(T_before: Array, T_now: Array) -> Array:
+    """Own motion (4, 4) between two poses in one world frame: the `odometry` they would give."""
+    return invert(T_before) @ T_now
