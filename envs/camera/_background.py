@@ -32,13 +32,13 @@ def draw_background(camera, light, look, noise, shadow, contact, shadow_spans, r
     eye = (f32(camera[9] + NOISE_SHIFT), f32(camera[10] + NOISE_SHIFT))
     iz_step = f32(camera[6] / fx * scale)
     haze = f32(light[4])
-    lit = light[3] * 1.15 + (1.0 - light[3]) * max(0.0, light[2])
+    lit = light[3] * (1.15 + 0.15 * light[2]) + (1.0 - light[3]) * max(0.0, light[2])
     far = (f32(light[8]), f32(light[9]), f32(light[10]))
     blue = (f32(light[5] - light[8]), f32(light[6] - light[9]), f32(light[7] - light[10]))
     earth = (f32(light[11] * lit), f32(light[12] * lit), f32(light[13] * lit))
     clouds = f32(look[2])
     # Shares of sky and sun in the ground's light: a shadow takes nearly all of the sun's, feet some of the sky's.
-    from_sky = f32(light[3] * 1.15 / max(lit, 1e-9))
+    from_sky = f32(light[3] * (1.15 + 0.15 * light[2]) / max(lit, 1e-9))
     shades = np.empty(width, np.float32)
     cells = np.empty((2, width), np.uint32)
     for row in range(height):

@@ -179,7 +179,7 @@ def draw_bodies(  # type: ignore[no-untyped-def]
             if not drawn:
                 continue
             kind = int(kinds[f] & (SMOOTH | PATTERNED))
-            from_sky = _from_sky(px, py, pz, up, ambient)
+            from_sky = _from_sky(px, py, pz, up, sun, ambient)
             from_sun = (1.0 - ambient) * max(0.0, px * sun[0] + py * sun[1] + pz * sun[2])
             lit = from_sky + from_sun
             if kind & SMOOTH:
@@ -373,9 +373,10 @@ def _to_camera(x, y, z, camera, projected, k):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _from_sky(nx, ny, nz, up, ambient):  # type: ignore[no-untyped-def]
-    """Light a face gets from sky and ground; the sky gives more than the ground."""
-    return ambient * (0.95 + 0.2 * (nx * up[0] + ny * up[1] + nz * up[2]))
+def _from_sky(nx, ny, nz, up, sun, ambient):  # type: ignore[no-untyped-def]
+    """Light a face gets from sky and ground: the sky gives more than the ground, and more on the sun's side."""
+    facing_up, facing_sun = nx * up[0] + ny * up[1] + nz * up[2], nx * sun[0] + ny * sun[1] + nz * sun[2]
+    return ambient * (0.95 + 0.2 * facing_up + 0.15 * facing_sun)
 
 
 @njit(cache=True, error_model="numpy")
@@ -393,7 +394,7 @@ def _record_brightness(record, normals, dual, vertices, first, up, sun, ambient,
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _brightness(nx, ny, nz, up, sun, ambient):  # type: ignore[no-untyped-def]
-    return _from_sky(nx, ny, nz, up, ambient) + (1.0 - ambient) * max(0.0, nx * sun[0] + ny * sun[1] + nz * sun[2])
+    return _from_sky(nx, ny, nz, up, sun, ambient) + (1.0 - ambient) * max(0.0, nx * sun[0] + ny * sun[1] + nz * sun[2])
 
 
 @njit(cache=True, error_model="numpy")

@@ -5,38 +5,84 @@ Bodies come from pybullet; ground and sky, which its renderers lack, from our ke
 
 from __future__ import annotations
 
+import contextlib
+import importlib.util
+import tempfile
+import weakref
 from collections.abc import Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..worlds.bullet import connect, load_pybullet
+from ..worlds.bullet import connect, load_pybullet, silence
 from ..worlds.world import Array, Mesh, Snapshot
 from .raster import NOBODY, Frame, Rasterizer
 
 TINY_SAMPLE_OFFSET = (0.0, 1.0)
 """Where TinyRenderer samples a pixel (right, down): its lower left corner, not its centre."""
 
+EGL_SAMPLE_OFFSET = (0.5, 0.5)
+
 NEAR_M, FAR_M = 0.1, 300.0
 AWAY_M = 1e5
 NONE = np.zeros(0, np.int64)
+_EGL_CLIENTS: set[int] = set()
 
 
-class TinyCamera:
-    """pybullet's TinyRenderer as a camera of snapshots, with the interface of `Rasterizer`.
+def make_camera(backend: str, meshes: Sequence[Mesh], width: int, height: int, **options: Any) -> Camera:
+    """A camera that draws snapshots: backend "raster" (ours), "tiny" or "egl" (pybullet's); options go to its class.
 
-    One visual shape per mesh, in the mesh's mean colour times the tint: TinyRenderer has no colours per face.
+    Raises:
+        ValueError: no such backend.
+        ImportError: the backend needs pybullet, which is not installed.
+        RuntimeError: "egl" where EGL cannot start.
+    """
+    if backend == "raster":
+        return Rasterizer(meshes, width, height, **options)
+    if backend in ("tiny", "egl"):
+        return BulletCamera(meshes, width, height, renderer=backend, **options)
+    raise ValueError(f'backend must be "raster", "tiny" or "egl", got {backend!r}')
+
+
+class Camera(Protocol):
+    """What every backend offers."""
+
+    width: int
+    height: int
+
+    def render(self, snapshot: Snapshot, robot: int, intrinsics: Array, *, out: Frame | None = None) -> Frame:
+        """The frame of one robot's camera, with intrinsics (3, 3)."""
+
+    def render_view(
+        self,
+        snapshot: Snapshot,
+        T_world_camera: Array,
+        intrinsics: Array,
+        *,
+        hidden_object: int = NOBODY,
+        out: Frame | None = None,
+    ) -> Frame:
+        """The frame of a camera anywhere."""
+
+
+class BulletCamera:
+    """pybullet's TinyRenderer, or its EGL plugin (OpenGL without a display), as a camera of snapshots.
+
+    One visual shape per mesh, in the mesh's mean colour times the tint: pybullet has no colours per face.
 
     Args:
         meshes: every mesh a snapshot may refer to.
         width, height: pixels.
-        centred: shift the picture so that pixels are sampled at their centres, as ours are; False keeps pybullet's.
-        shadows: TinyRenderer's shadows, 1.7 to 3 times slower.
+        renderer: "tiny" or "egl".
+        centred: shift the picture so that pixels are sampled at their centres; False keeps TinyRenderer's way.
+        shadows: pybullet's shadows, 1.7 to 3 times slower.
         ground: also draw a square of ground in pybullet, so that it does the work our camera does; for comparing speed.
 
     Raises:
         ImportError: pybullet is not installed.
+        RuntimeError: EGL cannot start on this machine.
     """
 
     def __init__(
@@ -45,6 +91,7 @@ class TinyCamera:
         width: int,
         height: int,
         *,
+        renderer: str = "tiny",
         centred: bool = True,
         shadows: bool = False,
         ground: bool = False,
@@ -53,7 +100,17 @@ class TinyCamera:
         self.width, self.height = int(width), int(height)
         self.centred, self.shadows = bool(centred), bool(shadows)
         self._client = connect()
+        self._quit = weakref.finalize(self, _disconnect, self._client)
+        self._renderer = self._pybullet.ER_TINY_RENDERER
+        self._sample_offset = TINY_SAMPLE_OFFSET
+        if renderer == "egl":
+            self._renderer = self._pybullet.ER_BULLET_HARDWARE_OPENGL
+            self._sample_offset = EGL_SAMPLE_OFFSET
+            _load_egl(self._client)
+        elif renderer != "tiny":
+            raise ValueError(f'renderer must be "tiny" or "egl", got {renderer!r}')
         self._meshes = tuple(meshes)
+        self._drawn = False
         self._shapes: dict[int, int] = {}
         self._bodies: list[tuple[int, int]] = []  # (mesh, pybullet's id) in drawing order
         self._tints: Array = np.zeros((0, 3))
@@ -116,17 +173,19 @@ class TinyCamera:
         """Only pybullet's own work on what was placed: RGB (H, W, 3), depth (H, W) m, pybullet's body ids (H, W)."""
         K = np.array(intrinsics, dtype=np.float64)
         if self.centred:
-            K[0, 2] += TINY_SAMPLE_OFFSET[0] - 0.5
-            K[1, 2] += TINY_SAMPLE_OFFSET[1] - 0.5
-        _, _, colors, buffer, ids = self._pybullet.getCameraImage(
-            self.width,
-            self.height,
-            view_matrix(T_world_camera),
-            projection_matrix(K, self.width, self.height),
-            shadow=int(self.shadows),
-            renderer=self._pybullet.ER_TINY_RENDERER,
-            physicsClientId=self._client,
-        )
+            K[0, 2] += self._sample_offset[0] - 0.5
+            K[1, 2] += self._sample_offset[1] - 0.5
+        with contextlib.nullcontext() if self._drawn else silence():
+            _, _, colors, buffer, ids = self._pybullet.getCameraImage(
+                self.width,
+                self.height,
+                view_matrix(T_world_camera),
+                projection_matrix(K, self.width, self.height),
+                shadow=int(self.shadows),
+                renderer=self._renderer,
+                physicsClientId=self._client,
+            )
+        self._drawn = True
         # pybullet returns tuples instead of arrays when it was built without NumPy.
         shape = (self.height, self.width)
         depth = np.reshape(np.asarray(buffer, np.float32), shape)
@@ -136,9 +195,7 @@ class TinyCamera:
 
     def close(self) -> None:
         """Disconnect from pybullet; calling it twice is harmless."""
-        if self._client >= 0:
-            self._pybullet.disconnect(self._client)
-            self._client = -1
+        self._quit()
 
     def _shape(self, mesh: int) -> int:
         if mesh not in self._shapes:
@@ -148,14 +205,53 @@ class TinyCamera:
 
     def _shape_of(self, vertices: Array, indices: NDArray[Any]) -> int:
         p = self._pybullet
-        return int(
-            p.createVisualShape(
-                p.GEOM_MESH, vertices=vertices.tolist(), indices=indices.tolist(), physicsClientId=self._client
-            )
-        )
+        with silence():
+            if self._renderer == p.ER_TINY_RENDERER:
+                return int(
+                    p.createVisualShape(
+                        p.GEOM_MESH, vertices=vertices.tolist(), indices=indices.tolist(), physicsClientId=self._client
+                    )
+                )
+            # The EGL plugin crashes on meshes from memory; from a file it takes them.
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(folder) / "mesh.obj"
+                path.write_text(_wavefront(vertices, indices))
+                return int(p.createVisualShape(p.GEOM_MESH, fileName=str(path), physicsClientId=self._client))
 
     def _body(self, shape: int) -> int:
         return int(self._pybullet.createMultiBody(0, -1, shape, physicsClientId=self._client))
+
+
+def _wavefront(vertices: Array, indices: NDArray[Any]) -> str:
+    """The mesh as an OBJ file, with corners and normals of their own for each face, so that it is shaded flat."""
+    lines = []
+    for n, face in enumerate(indices.reshape(-1, 3)):
+        a, b, c = vertices[face]
+        normal = np.cross(b - a, c - a)
+        normal = normal / max(float(np.linalg.norm(normal)), 1e-12)
+        lines += [f"v {x} {y} {z}" for x, y, z in (a, b, c)]
+        lines.append("vn {} {} {}".format(*normal))
+        lines.append("f " + " ".join(f"{3 * n + k}//{n + 1}" for k in (1, 2, 3)))
+    return "\n".join([*lines, ""])
+
+
+def _disconnect(client: int) -> None:
+    with silence():
+        load_pybullet().disconnect(client)
+    _EGL_CLIENTS.discard(client)
+
+
+def _load_egl(client: int) -> None:
+    if _EGL_CLIENTS:
+        raise RuntimeError("pybullet can have one EGL camera open in a process: close the other one first")
+    library = importlib.util.find_spec("eglRenderer")
+    if library is None or library.origin is None:
+        raise RuntimeError("this build of pybullet has no EGL plugin")
+    with silence():
+        plugin = load_pybullet().loadPlugin(library.origin, "_eglRendererPlugin", physicsClientId=client)
+    if plugin < 0:
+        raise RuntimeError("pybullet's EGL plugin did not start: it needs EGL and OpenGL 3.3, for example Mesa's")
+    _EGL_CLIENTS.add(client)
 
 
 def view_matrix(T_world_camera: Array) -> list[float]:

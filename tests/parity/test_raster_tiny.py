@@ -55,7 +55,7 @@ def test_masks_and_depths_agree(seed: int, centred: bool) -> None:
     snapshot, (width, height) = scene(seed), (320, 240)
     K = intrinsics_from_fov(width, height, np.radians(70))
     offset = (0.5, 0.5) if centred else backends.TINY_SAMPLE_OFFSET
-    tiny = backends.TinyCamera(MESHES, width, height, centred=centred)
+    tiny = backends.BulletCamera(MESHES, width, height, centred=centred)
     theirs = tiny.render(snapshot, 0, K)
     tiny.close()
     tiny.close()
@@ -73,7 +73,7 @@ def test_without_the_shift_the_masks_disagree() -> None:
     """Guards the test above: it would not pass whatever the renderers draw."""
     snapshot, (width, height) = scene(0), (320, 240)
     K = intrinsics_from_fov(width, height, np.radians(70))
-    theirs = backends.TinyCamera(MESHES, width, height, centred=False).render(snapshot, 0, K)
+    theirs = backends.BulletCamera(MESHES, width, height, centred=False).render(snapshot, 0, K)
     ours = Rasterizer(MESHES, width, height).render(snapshot, 0, K)
     iou = [
         ((ours.instances == k) & (theirs.instances == k)).sum()
@@ -85,7 +85,50 @@ def test_without_the_shift_the_masks_disagree() -> None:
 
 
 def test_pybullet_prints_nothing(capfd: pytest.CaptureFixture[str]) -> None:
-    camera = backends.TinyCamera(MESHES, 32, 24)
+    camera = backends.BulletCamera(MESHES, 32, 24)
     camera.render(scene(0), 0, intrinsics_from_fov(32, 24, 1.2))
     camera.close()
     assert capfd.readouterr() == ("", "")
+
+
+def test_egl_draws_the_same_and_prints_nothing(capfd: pytest.CaptureFixture[str]) -> None:
+    """OpenGL samples pixel centres, as we do."""
+    snapshot, (width, height) = scene(1), (320, 240)
+    K = intrinsics_from_fov(width, height, np.radians(70))
+    try:
+        camera = backends.make_camera("egl", MESHES, width, height)
+    except RuntimeError as error:
+        pytest.skip(str(error))
+    with pytest.raises(RuntimeError, match="one EGL camera"):
+        backends.make_camera("egl", MESHES, width, height)
+    theirs = camera.render(snapshot, 0, K)
+    camera.close()
+    ours = backends.make_camera("raster", MESHES, width, height).render(snapshot, 0, K)
+    large = [k for k in range(15) if (theirs.instances == k).sum() >= MIN_PIXELS]
+    assert len(large) >= 4
+    for k in large:
+        a, b = ours.instances == k, theirs.instances == k
+        assert (a & b).sum() >= 0.97 * (a | b).sum()
+        assert np.median(np.abs(ours.depth[a & b] / theirs.depth[a & b] - 1)) <= 0.005
+    assert capfd.readouterr() == ("", "")
+
+
+def test_the_own_body_is_hidden_and_tints_and_moves_follow() -> None:
+    snapshot = scene(2)
+    K = intrinsics_from_fov(160, 120, np.radians(70))
+    camera = backends.make_camera("tiny", MESHES, 160, 120)
+    before = camera.render(snapshot, 0, K)
+    counts = np.bincount(before.instances[before.instances >= 0], minlength=15)
+    seen = int(counts.argmax())
+    snapshot.robot_object[0] = seen
+    assert not (camera.render(snapshot, 0, K).instances == seen).any()
+    snapshot.robot_object[0] = -1
+    snapshot.body_tints[:] = (1.0, 0.0, 0.0)
+    red = camera.render(snapshot, 0, K)
+    assert (red.rgb[red.instances == seen][:, 1] < before.rgb[before.instances == seen][:, 1].mean()).all()
+    np.testing.assert_array_equal(red.instances, before.instances)
+
+
+def test_an_unknown_backend_is_named() -> None:
+    with pytest.raises(ValueError, match="'vulkan'"):
+        backends.make_camera("vulkan", MESHES, 4, 4)
