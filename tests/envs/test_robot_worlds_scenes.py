@@ -5,8 +5,10 @@ from __future__ import annotations
 import dataclasses
 import math
 import pickle
+import struct
 import subprocess
 import sys
+from pathlib import Path
 from types import ModuleType
 
 import numpy as np
@@ -16,13 +18,14 @@ from covis.envs.worlds import aerial_ground, multi_robot, target_localization
 from covis.envs.worlds.aerial_ground import AerialGroundParams, AerialGroundWorld
 from covis.envs.worlds.layout import place_apart
 from covis.envs.worlds.lighting import TIMES_OF_DAY, sample_light
-from covis.envs.worlds.models import ROBOT_CLASSES, models
+from covis.envs.worlds.models import ROBOT_CLASSES, models, stock_husky
 from covis.envs.worlds.multi_robot import MultiRobotParams, MultiRobotWorld
 from covis.envs.worlds.peers import TinyPeer, gl_matrices, speed_params
 from covis.envs.worlds.robots import RobotWorld
 from covis.envs.worlds.statistics import scene_statistics
 from covis.envs.worlds.target_localization import TargetLocalizationParams, TargetLocalizationWorld
 from covis.envs.worlds.team import advance_waypoints, team_commands
+from covis.envs.worlds.urdf import simplified, urdf_mesh
 from covis.envs.worlds.wheels import WheelDynamics
 from covis.envs.worlds.world import SceneGenerationError, Snapshot
 
@@ -298,6 +301,47 @@ def test_models_stand_on_the_ground_within_their_boxes() -> None:
             assert ROBOT_CLASSES[model.object_class].name == model.name
             assert half.size == pytest.approx(0.5 * model.size)
         assert len(model.mesh.faces) < 600
+
+
+def test_stock_meshes_at_any_level_of_detail() -> None:
+    """Coarser has fewer triangles and about the same box; the finest is the files' own."""
+    levels = [stock_husky(d) for d in (0.0, 0.02, 0.05)]
+    counts = [len(mesh.faces) for mesh in levels]
+    assert counts[0] > 30000 > 3 * counts[1] > 9 * counts[2] > 0
+    for mesh in levels:
+        assert np.ptp(mesh.vertices, axis=0) == pytest.approx([0.98, 0.68, 0.385], abs=0.03)
+        assert mesh.vertices[:, 2].min() == pytest.approx(0.0, abs=0.01)
+        assert np.unique(mesh.faces).max() == len(mesh.vertices) - 1
+    world = MultiRobotWorld(2, MultiRobotParams(n_team=3, meshes="stock"))
+    world.reset(np.random.default_rng(0))
+    s = world.snapshot()
+    assert s.sizes[0] == pytest.approx(np.ptp(world.meshes[s.body_mesh[0]].vertices, axis=0))
+    assert len(world.meshes[s.body_mesh[0]].faces) > 1000
+    world.close()
+    with pytest.raises(ValueError, match=r"meshes.*high"):
+        MultiRobotParams(meshes="high")
+
+
+def test_urdf_meshes_stand_where_their_joints_put_them(tmp_path: Path) -> None:
+    """A tetrahedron as STL on a link turned by 90 degrees about z and moved."""
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]], dtype="<f4")
+    faces = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
+    body = b"".join(struct.pack("<12fH", 0, 0, 0, *corners[list(face)].ravel(), 0) for face in faces)
+    (tmp_path / "tetra.stl").write_bytes(b" " * 80 + struct.pack("<I", 4) + body)
+    (tmp_path / "robot.urdf").write_text(
+        '<robot name="r"><material name="paint"><color rgba="1 0.5 0 1"/></material><link name="root"/>'
+        '<link name="arm"><visual><geometry><mesh filename="tetra.stl"/></geometry><material name="paint"/></visual>'
+        '</link><joint name="j" type="fixed"><origin xyz="0 0 1" rpy="0 0 1.5707963"/>'
+        '<parent link="root"/><child link="arm"/></joint></robot>'
+    )
+    mesh = urdf_mesh(str(tmp_path / "robot.urdf"))
+    expected = np.array([[0, 0, 1], [0, 1, 1], [-2, 0, 1], [0, 0, 4]])
+    assert sorted(np.round(mesh.vertices, 5).tolist()) == sorted(expected.tolist())
+    assert (mesh.colors == [255, 128, 0]).all()
+    assert len(simplified(mesh, 10.0).faces) == 0
+    (tmp_path / "tetra.stl").write_bytes(b"solid ascii")
+    with pytest.raises(ValueError, match=r"tetra\.stl"):
+        urdf_mesh(str(tmp_path / "robot.urdf"))
 
 
 def test_statistics_of_a_scene_made_to_measure() -> None:
