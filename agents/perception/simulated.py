@@ -158,7 +158,7 @@ class SimulatedPerception:
         return Detections(graph, boxes)
 
     def _hidden_share(self, occlusion: Array, cut: NDArray[np.bool_]) -> Array:
-        """Sigma of the centre (n, 2), right and down, in half widths of the object; `cut` (n, 4) tells by which edge."""
+        """Sigma of the centre (n, 2), right and down, in half widths of the object; `cut` (n, 4): by which edge."""
         p = self.params
         sideways = np.minimum(p.hidden_occluded * occlusion, p.hidden_cut)
         occluded = np.stack([sideways, p.hidden_upright * sideways], axis=1)
