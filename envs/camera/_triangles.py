@@ -105,6 +105,7 @@ def draw_bodies(  # type: ignore[no-untyped-def]
             up[j] = pose[2, j]
         base = first_vertex[mesh]
         left, right, top, bottom = float(width), 0.0, float(height), 0.0
+        in_front = True
         for k in range(first_vertex[mesh + 1] - base):
             px, py, pz = vertices[base + k, 0], vertices[base + k, 1], vertices[base + k, 2]
             x = R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz + t[0]
@@ -121,6 +122,7 @@ def draw_bodies(  # type: ignore[no-untyped-def]
                 projected[k, 4] = v
                 left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
             else:
+                in_front = False
                 left, right, top, bottom = 0.0, float(width), 0.0, float(height)
         left, right, top, bottom = max(left, 0.0), min(right, float(width)), max(top, 0.0), min(bottom, float(height))
         if left >= right or top >= bottom:
@@ -134,11 +136,24 @@ def draw_bodies(  # type: ignore[no-untyped-def]
             behind = planes[f, 3] - (px * eye[0] + py * eye[1] + pz * eye[2])
             if behind >= 0.0:
                 continue
-            corners = _project_face(
-                faces[f, 0], faces[f, 1], faces[f, 2], projected, near, fx, fy, cx, cy, offset_u, offset_v, polygon
-            )
-            if corners == 0:
-                continue
+            corners = 3
+            i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+            if in_front:
+                x0, y0 = projected[i, 3], projected[i, 4]
+                x1, y1 = projected[j, 3], projected[j, 4]
+                x2, y2 = projected[k, 3], projected[k, 4]
+                # Most faces of a far body lie between the sample points.
+                if ceil(min(x0, min(x1, x2))) >= ceil(max(x0, max(x1, x2))):
+                    continue
+                if ceil(min(y0, min(y1, y2))) >= ceil(max(y0, max(y1, y2))):
+                    continue
+            else:
+                corners = _project_face(i, j, k, projected, near, fx, fy, cx, cy, offset_u, offset_v, polygon)
+                if corners == 0:
+                    continue
+                x0, y0 = polygon[0, 0], polygon[0, 1]
+                x1, y1 = polygon[1, 0], polygon[1, 1]
+                x2, y2 = polygon[2, 0], polygon[2, 1]
             # The face's plane n.p = d in the camera frame gives 1/z as an affine function of the pixel.
             nx = R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz
             ny = R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz
@@ -147,35 +162,10 @@ def draw_bodies(  # type: ignore[no-untyped-def]
             iz_u = nx * scale / fx
             iz_v = ny * scale / fy
             iz_0 = nz * scale + iz_u * (offset_u - cx) + iz_v * (offset_v - cy)
-            drawn = _fill(
-                polygon[0, 0],
-                polygon[0, 1],
-                polygon[1, 0],
-                polygon[1, 1],
-                polygon[2, 0],
-                polygon[2, 1],
-                iz_u,
-                iz_v,
-                iz_0,
-                count,
-                inverse_depth,
-                triangle_at,
-            )
+            drawn = _fill(x0, y0, x1, y1, x2, y2, iz_u, iz_v, iz_0, count, inverse_depth, triangle_at)
             if corners == 4:
-                drawn |= _fill(
-                    polygon[0, 0],
-                    polygon[0, 1],
-                    polygon[2, 0],
-                    polygon[2, 1],
-                    polygon[3, 0],
-                    polygon[3, 1],
-                    iz_u,
-                    iz_v,
-                    iz_0,
-                    count,
-                    inverse_depth,
-                    triangle_at,
-                )
+                x3, y3 = polygon[3, 0], polygon[3, 1]
+                drawn |= _fill(x0, y0, x2, y2, x3, y3, iz_u, iz_v, iz_0, count, inverse_depth, triangle_at)
             if not drawn:
                 continue
             kind = int(kinds[f] & (SMOOTH | PATTERNED))

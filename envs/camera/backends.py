@@ -170,13 +170,23 @@ class BulletCamera:
     def draw(
         self, T_world_camera: Array, intrinsics: Array
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.int64]]:
-        """Only pybullet's own work on what was placed: RGB (H, W, 3), depth (H, W) m, pybullet's body ids (H, W)."""
+        """What was placed: RGB (H, W, 3), depth (H, W) m, pybullet's body ids (H, W)."""
+        _, _, colors, buffer, ids = self.capture(T_world_camera, intrinsics)
+        # pybullet returns tuples instead of arrays when it was built without NumPy.
+        shape = (self.height, self.width)
+        depth = np.reshape(np.asarray(buffer, np.float32), shape)
+        depth = (FAR_M * NEAR_M / (FAR_M - (FAR_M - NEAR_M) * depth.astype(np.float64))).astype(np.float32)
+        rgb = np.reshape(np.asarray(colors, np.uint8), (*shape, 4))[..., :3]
+        return rgb, depth, np.reshape(np.asarray(ids, np.int64), shape)
+
+    def capture(self, T_world_camera: Array, intrinsics: Array) -> tuple[Any, ...]:
+        """Only pybullet's own work on what was placed: what its `getCameraImage` returns."""
         K = np.array(intrinsics, dtype=np.float64)
         if self.centred:
             K[0, 2] += self._sample_offset[0] - 0.5
             K[1, 2] += self._sample_offset[1] - 0.5
         with contextlib.nullcontext() if self._drawn else silence():
-            _, _, colors, buffer, ids = self._pybullet.getCameraImage(
+            picture = self._pybullet.getCameraImage(
                 self.width,
                 self.height,
                 view_matrix(T_world_camera),
@@ -186,12 +196,7 @@ class BulletCamera:
                 physicsClientId=self._client,
             )
         self._drawn = True
-        # pybullet returns tuples instead of arrays when it was built without NumPy.
-        shape = (self.height, self.width)
-        depth = np.reshape(np.asarray(buffer, np.float32), shape)
-        depth = (FAR_M * NEAR_M / (FAR_M - (FAR_M - NEAR_M) * depth.astype(np.float64))).astype(np.float32)
-        rgb = np.reshape(np.asarray(colors, np.uint8), (*shape, 4))[..., :3]
-        return rgb, depth, np.reshape(np.asarray(ids, np.int64), shape)
+        return tuple(picture)
 
     def close(self) -> None:
         """Disconnect from pybullet; calling it twice is harmless."""

@@ -11,8 +11,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from ..worlds.world import Array
-from .raster import Frame
+from ..worlds.world import Array, Snapshot
+from .raster import Frame, Rasterizer
 
 NOISE_TABLE = 1 << 15
 Range = tuple[float, float]
@@ -190,6 +190,36 @@ class Lens:
             raise ValueError(f"the lens takes {(self.wide_height, self.wide_width)} pixels, got {wide.depth.shape}")
         frame = Frame.empty(width, height) if out is None else out
         _bend(self._source, wide.rgb, wide.depth, wide.instances, frame.rgb, frame.depth, frame.instances)
+        return frame
+
+
+class SensorCamera:
+    """One robot's camera with its effects: an ideal picture, bent by the lens, then exposed.
+
+    Args:
+        ideal: draws the world at the picture's size; its meshes are shared, so a camera an episode costs little.
+        intrinsics: (3, 3) of the picture, that is of the camera without its distortion.
+        effects: this camera's character.
+    """
+
+    def __init__(self, ideal: Rasterizer, intrinsics: Array, effects: SensorEffects) -> None:
+        self.intrinsics, self.effects = intrinsics, effects
+        self._ideal = ideal
+        self._lens: Lens | None = None
+        self._wide: Frame | None = None
+        if effects.distorts:
+            self._lens = Lens(effects, intrinsics, ideal.width, ideal.height)
+            self._ideal = ideal.resized(self._lens.wide_width, self._lens.wide_height)
+            self._wide = Frame.empty(self._lens.wide_width, self._lens.wide_height)
+
+    def render(self, snapshot: Snapshot, robot: int, rng: np.random.Generator, *, out: Frame | None = None) -> Frame:
+        """The frame of one robot's camera; `rng` draws the noise. Depth and instances are bent like the colours."""
+        if self._lens is None:
+            frame = self._ideal.render(snapshot, robot, self.intrinsics, out=out)
+        else:
+            wide = self._ideal.render(snapshot, robot, self._lens.wide_intrinsics, out=self._wide)
+            frame = self._lens.bend(wide, out)
+        expose(frame.rgb, self.effects, rng, out=frame.rgb)
         return frame
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -149,6 +150,8 @@ class Rasterizer:
         self._projected = np.empty((max(4, *(len(m.vertices) for m in meshes), 4), 5))
         self._triangles = np.empty((1024, TRIANGLE_FIELDS), np.float32)
         self._noise = _noise_tile().ravel()
+        self._light = Light()
+        self._light_row = light_row(self._light, look.haze_m)
         self._fine: Rasterizer | None = None
         if look.samples > 1:
             self._fine = Rasterizer(
@@ -160,6 +163,14 @@ class Rasterizer:
                 own_body=own_body,
             )
             self._fine_frame = Frame.empty(self._fine.width, self._fine.height)
+
+    def resized(self, width: int, height: int) -> Rasterizer:
+        """A rasteriser of the same meshes and look at another size; it shares their preparation."""
+        other = Rasterizer((), width, height, look=self.look, near_m=self.near_m, own_body=self.own_body)
+        other.sample_offset, other._geometry, other._projected = self.sample_offset, self._geometry, self._projected
+        if other._fine is not None and self._fine is not None:
+            other._fine._geometry, other._fine._projected = self._fine._geometry, self._fine._projected
+        return other
 
     def render(self, snapshot: Snapshot, robot: int, intrinsics: Array, *, out: Frame | None = None) -> Frame:
         """The frame of one robot's camera, with intrinsics (3, 3); into fresh arrays, or into those of `out`.
@@ -216,7 +227,9 @@ class Rasterizer:
             counts = (len(meshes), len(poses), len(body_tints), len(objects))
             raise ValueError(f"there are {counts} body meshes, poses, tints and objects; the counts must agree")
         camera = _camera_row(T_world_camera, intrinsics, self.sample_offset, self.near_m)
-        lights = light_row(light, self.look.haze_m)
+        if light is not self._light:
+            self._light, self._light_row = light, light_row(light, self.look.haze_m)
+        lights = self._light_row
         status, number = TABLE_FULL, len(self._triangles)
         while status == TABLE_FULL:
             status, number = draw_bodies(
@@ -364,14 +377,14 @@ def _camera_row(T_world_camera: Array, intrinsics: Array, sample_offset: tuple[f
     K = np.asarray(intrinsics, dtype=np.float64)
     if T.shape != (4, 4):
         raise ValueError(f"T_world_camera must have shape (4, 4), got {T.shape}")
-    if not np.isfinite(T).all():
-        raise ValueError(f"T_world_camera must be finite, got\n{T}")
     if K.shape != (3, 3) or not (K[0, 0] > 0 and K[1, 1] > 0 and K[0, 1] == K[1, 0] == 0 and K[2, 2] == 1):
         raise ValueError(f"intrinsics must be a pinhole matrix (3, 3) without skew, got\n{K}")
     row = np.empty(19)
     row[:9] = T[:3, :3].ravel()
     row[9:12] = T[:3, 3]
     row[12:] = K[0, 0], K[1, 1], K[0, 2], K[1, 2], *sample_offset, near_m
+    if not isfinite(row.sum()):
+        raise ValueError(f"T_world_camera and intrinsics must be finite, got\n{T}\n{K}")
     return row
 
 

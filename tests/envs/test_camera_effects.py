@@ -9,7 +9,7 @@ from covis.envs.camera import effects as fx
 from covis.envs.camera import shapes
 from covis.envs.camera.mount import Mount
 from covis.envs.camera.raster import Frame, Rasterizer, intrinsics_from_fov, look_at
-from covis.envs.worlds.world import Light
+from covis.envs.worlds.world import Light, Snapshot
 
 WIDTH, HEIGHT = 120, 90
 K = intrinsics_from_fov(WIDTH, HEIGHT, np.radians(80))
@@ -99,6 +99,44 @@ def test_blur_spreads_an_edge_and_keeps_the_mean() -> None:
     kernel = np.diff(soft[HEIGHT // 2, :, 0]) / 200
     at = np.arange(len(kernel)) - (kernel * np.arange(len(kernel))).sum()
     assert np.sqrt((kernel * at**2).sum()) == pytest.approx(2.0, rel=0.05)
+
+
+@pytest.mark.parametrize("effects", [fx.SensorEffects(exposure=0.5), fx.SensorEffects(k1=-0.1, read_noise=2.0)])
+def test_a_sensor_camera_renders_bends_and_exposes(effects: fx.SensorEffects) -> None:
+    poses = np.eye(4)[None].copy()
+    scene = Snapshot(
+        time=0.0,
+        identity=np.arange(1),
+        object_class=np.zeros(1, np.int64),
+        positions=np.zeros((1, 3)),
+        velocities=np.zeros((1, 3)),
+        headings=np.zeros(1),
+        sizes=np.ones((1, 3)),
+        body_mesh=np.zeros(1, np.int64),
+        body_poses=poses,
+        body_tints=np.ones((1, 3)),
+        body_object=np.zeros(1, np.int64),
+        T_world_camera=look_at((-3, 0, 1.5), (0, 0, 0.3))[None],
+        robot_object=np.array([-1]),
+        robot_velocity=np.zeros((1, 3)),
+        robot_state=np.zeros((1, 1)),
+        collided=np.zeros(1, bool),
+        light=Light(),
+    )
+    ideal = Rasterizer([shapes.husky()], WIDTH, HEIGHT)
+    frame = fx.SensorCamera(ideal, K, effects).render(scene, 0, rng())
+    plain = ideal.render(scene, 0, K)
+    if not effects.distorts:
+        np.testing.assert_array_equal(frame.instances, plain.instances)
+        assert frame.rgb.mean() == pytest.approx(0.5 * plain.rgb.mean(), rel=0.02)
+    else:
+        optics = fx.Lens(effects, K, WIDTH, HEIGHT)
+        wide = Rasterizer([shapes.husky()], optics.wide_width, optics.wide_height)
+        bent = optics.bend(wide.render(scene, 0, optics.wide_intrinsics))
+        np.testing.assert_array_equal(frame.depth, bent.depth)
+        np.testing.assert_array_equal(frame.rgb, fx.expose(bent.rgb, effects, rng()))
+    again = fx.SensorCamera(ideal, K, effects).render(scene, 0, rng())
+    np.testing.assert_array_equal(frame.rgb, again.rgb)
 
 
 def test_draws_come_from_the_rng_and_stay_in_range() -> None:

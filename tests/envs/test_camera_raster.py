@@ -254,6 +254,7 @@ def test_looking_straight_down_shows_the_map() -> None:
         (lambda c, s, K: c.render(s, 0, np.zeros((3, 3))), "intrinsics"),
         (lambda c, s, K: c.render(s, 0, K, out=Frame.empty(3, 3)), "out.rgb"),
         (lambda c, s, K: c.render_view(s, np.eye(3), K), "T_world_camera"),
+        (lambda c, s, K: c.render_view(s, np.full((4, 4), np.nan), K), "finite"),
         (lambda c, s, K: Rasterizer([], 10, 10).render(s, 0, K), "mesh"),
         (lambda c, s, K: Rasterizer([], 0, 10), "0x10"),
         (lambda c, s, K: Rasterizer([], 10, 10, near_m=0.0), "near_m"),
