@@ -50,7 +50,8 @@ class Answered:
 class _Episode:
     """Everything of the environment itself that changes; a deep copy of it is its saved state.
 
-    `sums` and `totals` (N, N_SUMS) are those of the last step and of the episode, see `_sums`.
+    `sums` and `totals` (N, N_SUMS) are those of the last step and of the episode, see `_sums`; `trail` holds the
+    cameras' places (N, 2) at each instant, m.
     """
 
     noise_rng: np.random.Generator
@@ -62,6 +63,7 @@ class _Episode:
     totals: NDArray[np.float64]
     now: Instant
     before: Instant | None
+    trail: list[NDArray[np.float64]]
     marked: tuple[Any, Any] | None = None
 
     def mark(self) -> None:
@@ -181,6 +183,7 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         )
         self._seeds = EpisodeSeeds.start(seed)
         self._rasterizer: Rasterizer | None = None
+        self._painter: Any = None
         self._window: Any = None
         self._episode: _Episode | None = None
         space = action_space(self.world.control_size, self.max_detections, n - 1, self.width, self.height)
@@ -269,6 +272,7 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
             totals=np.zeros((n, N_SUMS)),
             now=self._look(snapshot),
             before=None,
+            trail=[snapshot.T_world_camera[:, :2, 3].copy()],
         )
         return self._observe(self._episode), self._infos(self._episode)
 
@@ -302,6 +306,7 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         episode.steps += 1
         snapshot = self._take_snapshot()
         episode.before, episode.now = episode.now, self._look(snapshot)
+        episode.trail.append(snapshot.T_world_camera[:, :2, 3].copy())
         crashed = bool(self.world.ends_on_collision and snapshot.collided.any())
         over = episode.steps >= self.max_cycles
         observations, infos = self._observe(episode), self._infos(episode)
@@ -455,6 +460,14 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
             return None
         return Answered(episode.before, tuple(episode.claims), episode.score)
 
+    def now(self) -> Instant:
+        """The instant of the last observation, for evaluation. Raises RuntimeError before the first reset."""
+        return self._running("now()").now
+
+    def trail(self) -> NDArray[np.float64]:
+        """Where the cameras were at each instant of the episode (t, N, 2), m. Raises like `now`."""
+        return np.stack(self._running("trail()").trail)
+
     def snapshot(self) -> Snapshot:
         """The world at the instant of the last observation. Raises RuntimeError before the first reset."""
         return self._running("snapshot()").now.snapshot
@@ -486,12 +499,15 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
     # Pictures
 
     def render(self) -> NDArray[np.uint8] | None:
-        """All cameras and a map (H, W, 3); `human` shows it in a window instead."""
+        """All cameras and a map (H, W, 3), see `ScenePainter.compose`; `human` shows it in a window instead."""
         if self.render_mode is None:
             return None
-        from .render import compose, show
+        from .render import ScenePainter, show
 
-        picture = compose(self)
+        self._running("render()")
+        if self._painter is None:
+            self._painter = ScenePainter(self)
+        picture = self._painter.compose(self)
         if self.render_mode == "human":
             self._window = show(picture, self._window, self.name)
             return None

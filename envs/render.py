@@ -1,135 +1,182 @@
-"""Pictures for people: a map seen from above, and what every camera sees."""
+"""Pictures for people: what every camera sees, the scene from above, and two cameras with their matches."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .claims import Claims
+from .map_view import MapPainter, area_of, matched_identities
+from .paint import (
+    CANVAS,
+    FAINT,
+    GAP,
+    INK,
+    RIGHT,
+    WRONG,
+    Array,
+    Color,
+    Image,
+    below,
+    beside,
+    blank,
+    blend,
+    corners,
+    dashes,
+    disc,
+    identity_colors,
+    plate,
+    polyline,
+    robot_color,
+    text,
+    text_width,
+)
 from .scoring import StepScore
-from .worlds.world import Array, Snapshot
 
 if TYPE_CHECKING:
-    from .collaborative import CollaborativeEnv
+    from .collaborative import Answered, CollaborativeEnv, Instant
 
-Image = NDArray[np.uint8]
-Color = tuple[int, int, int]
-
-ROBOT_COLORS: tuple[Color, ...] = (
-    (0, 114, 178),
-    (213, 94, 0),
-    (0, 158, 115),
-    (204, 121, 167),
-    (86, 180, 233),
-    (230, 159, 0),
-    (120, 94, 240),
-    (60, 60, 60),
-)
-"""One per robot, distinguishable with colour-blind eyes (after Okabe and Ito)."""
-RIGHT: Color = (30, 190, 80)
-WRONG: Color = (225, 45, 45)
-INK: Color = (45, 48, 56)
-FAINT: Color = (200, 204, 210)
-PAPER: Color = (250, 250, 247)
-FONT = cv2.FONT_HERSHEY_SIMPLEX
-GAP = 6
+HEIGHT = 728
+"""Pixels of the map's side and of the stacked cameras."""
+HEAD = 44
 
 
-def robot_color(i: int) -> Color:
-    return ROBOT_COLORS[i % len(ROBOT_COLORS)]
+class ScenePainter:
+    """Draws one environment; keeps memory from picture to picture."""
 
+    def __init__(self, env: CollaborativeEnv) -> None:
+        self._map = MapPainter(env.world.meshes, HEIGHT)
 
-def text(picture: Image, words: str, at: tuple[int, int], size: float = 0.42, color: Color = INK) -> None:
-    cv2.putText(picture, words, at, FONT, size, color, 1, cv2.LINE_AA)
+    def compose(self, env: CollaborativeEnv) -> Image:
+        """Every camera on the left, the scene from above on the right, the figures of the last step over them.
 
-
-def label(picture: Image, words: str, at: tuple[int, int], color: Color) -> None:
-    """White words on a plate of `color`; `at` is the plate's upper left corner."""
-    (width, height), base = cv2.getTextSize(words, FONT, 0.4, 1)
-    u, v = at
-    cv2.rectangle(picture, (u, v), (u + width + 8, v + height + base + 4), color, -1)
-    cv2.putText(picture, words, (u + 4, v + height + 3), FONT, 0.4, (255, 255, 255), 1, cv2.LINE_AA)
+        After a step with claims the picture shows the instant they are about, else the present one. Boxes in a vivid
+        colour are objects matched right, one colour per object in all cameras and on the map; red ones are matched
+        wrong, corners are detections left alone. On the map dots are fused estimates with their 1-sigma circle and a
+        line to the truth.
+        """
+        answered = env.answered()
+        if answered is not None and not any(claims.filled().any() for claims in answered.claims):
+            answered = None
+        instant = env.now() if answered is None else answered.instant
+        trail = env.trail()[: None if answered is None else -1]
+        cameras = _cameras(instant, answered)
+        seen = np.any(instant.truth.visible(), axis=0)
+        area = area_of(instant.snapshot, seen, trail, HEIGHT)
+        fov = env.world.horizontal_fov_rad
+        plan = self._map.draw(instant.snapshot, fov, env.classes, area, trail, answered)
+        body = beside([cameras, plan])
+        head = _head(env.name, instant.snapshot.time, answered, body.shape[1])
+        return _framed(np.concatenate([head, body]))
 
 
 def compose(env: CollaborativeEnv) -> Image:
-    """Every camera on the left, two in a row, the map on the right."""
-    frames = env.camera_frames()
-    columns = 1 if len(frames) <= 2 else 2
-    cells = [_camera(frame.rgb, i) for i, frame in enumerate(frames)]
+    """The picture of `ScenePainter`, once."""
+    return ScenePainter(env).compose(env)
+
+
+def _framed(picture: Image) -> Image:
+    return cv2.copyMakeBorder(picture, 0, GAP, GAP, GAP, cv2.BORDER_CONSTANT, value=CANVAS).astype(np.uint8)
+
+
+def _head(name: str, time: float, answered: Answered | None, width: int) -> Image:
+    """Scene and time on the left, figures of the claims on the right."""
+    picture = blank(width, HEAD)
+    u = 2 + text(picture, name, (2, 29), 21, INK, True)
+    text(picture, f"t = {time:.1f} s", (u + 14, 29), 15, FAINT)
+    if answered is None:
+        return picture
+    score = answered.score
+    counts = score.counts
+    parts = [("right", f"{counts.correct}", RIGHT), ("wrong", f"{counts.retrieved - counts.correct}", WRONG)]
+    parts.append(("of", f"{score.n_visible} covisible", INK))
+    single, fused = score.error_single, score.error_fused
+    if np.isfinite(fused).any():
+        parts.append(("alone", f"{np.nanmean(single):.2f} m", INK))
+        parts.append(("fused", f"{np.nanmean(fused):.2f} m", INK))
+    u = width - sum(text_width(words, 15) + text_width(value, 17, True) + 24 for words, value, _ in parts)
+    for words, value, color in parts:
+        u += text(picture, words, (u, 29), 15, FAINT) + 6
+        u += text(picture, value, (u, 29), 17, color, True) + 18
+    return picture
+
+
+def _cameras(instant: Instant, answered: Answered | None) -> Image:
+    """All cameras in one or two columns, together HEIGHT high."""
+    n = len(instant.frames)
+    columns = 1 if n <= 2 else 2
+    rows = -(-n // columns)
+    edges = np.round(np.arange(rows + 1) * (HEIGHT + GAP) / rows).astype(int)
+    height, width = instant.frames[0].rgb.shape[:2]
+    across = round((HEIGHT + GAP) / rows - GAP) * width // height
+    cells = [
+        _camera(instant, i, answered, (across, int(edges[i // columns + 1] - edges[i // columns]) - GAP))
+        for i in range(n)
+    ]
     while len(cells) % columns:
-        cells.append(np.full_like(cells[0], PAPER))
-    rows = [_beside(cells[k : k + columns]) for k in range(0, len(cells), columns)]
-    cameras = _below(rows)
-    plan = draw_map(env.snapshot(), env.world.horizontal_fov_rad, cameras.shape[0])
-    return _beside([cameras, plan])
+        cells.append(blank(cells[-1].shape[1], cells[-1].shape[0]))
+    return below([beside(cells[k : k + columns]) for k in range(0, len(cells), columns)])
 
 
-def _camera(rgb: Image, i: int) -> Image:
-    picture = rgb.copy()
-    label(picture, f"robot_{i}", (0, 0), robot_color(i))
+def _camera(instant: Instant, i: int, answered: Answered | None, size: tuple[int, int]) -> Image:
+    rgb = instant.frames[i].rgb
+    scale = np.array(size) / rgb.shape[1::-1]
+    method = cv2.INTER_CUBIC if scale[0] > 1 else cv2.INTER_AREA
+    picture: Image = cv2.resize(rgb, size, interpolation=method).astype(np.uint8)
+    if answered is not None:
+        _claimed(picture, i, answered, scale)
+    cv2.rectangle(picture, (0, 0), (size[0] - 1, size[1] - 1), robot_color(i), 2)
+    plate(picture, f"robot_{i}", (8, 8), robot_color(i))
     return picture
 
 
-def draw_map(snapshot: Snapshot, fov: Array, size: int) -> Image:
-    """The scene from above (size, size, 3): objects as oriented boxes, robots with their fields of view, a scale."""
-    picture = np.full((size, size, 3), PAPER, dtype=np.uint8)
-    cameras = snapshot.T_world_camera[:, :2, 3]
-    points = np.concatenate([snapshot.positions[:, :2], cameras])
-    centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
-    metres = max(float(np.ptp(points, axis=0).max()) * 1.15, 4.0)
-    scale = size / metres
-
-    def pixel(xy: Array) -> Array:
-        return np.stack([(xy[..., 0] - centre[0]) * scale, (centre[1] - xy[..., 1]) * scale], axis=-1) + size / 2
-
-    fields = picture.copy()
-    for i, T in enumerate(snapshot.T_world_camera):
-        cv2.fillPoly(fields, [_fixed(pixel(_field_of_view(T, float(fov[i]), metres)))], robot_color(i), cv2.LINE_AA, 4)
-    cv2.addWeighted(fields, 0.16, picture, 0.84, 0, picture)
-    own = {int(j): i for i, j in enumerate(snapshot.robot_object) if j >= 0}
-    for j, (position, heading, extent) in enumerate(
-        zip(snapshot.positions, snapshot.headings, snapshot.sizes, strict=True)
-    ):
-        outline = _fixed(pixel(_rectangle(position[:2], float(heading), extent)))
-        color = robot_color(own[j]) if j in own else (120, 126, 136)
-        cv2.fillPoly(picture, [outline], color, cv2.LINE_AA, 4)
-    for i, camera in enumerate(cameras):
-        u, v = pixel(camera)
-        cv2.circle(picture, (round(u), round(v)), 4, robot_color(i), -1, cv2.LINE_AA)
-        cv2.circle(picture, (round(u), round(v)), 4, (255, 255, 255), 1, cv2.LINE_AA)
-    bar = _round_length(metres / 5)
-    cv2.line(picture, (12, size - 12), (12 + round(bar * scale), size - 12), INK, 2)
-    text(picture, f"{bar:g} m", (14, size - 18))
-    text(picture, f"t = {snapshot.time:.1f} s", (size - 80, size - 12))
-    return picture
+def _claimed(picture: Image, i: int, answered: Answered, scale: Array) -> None:
+    """Boxes of one robot's claims, and the outlines of the objects it matched right."""
+    claims, tied = answered.claims[i], answered.score.tied[i]
+    right, wrong = matched_slots(i, answered.score)
+    instances = answered.instant.frames[i].instances
+    size = picture.shape[1::-1]
+    identity = answered.instant.truth.identity
+    colors = identity_colors(matched_identities(answered))
+    filled = np.flatnonzero(claims.filled())
+    for k in filled:
+        box = claims.boxes[k] * np.tile(scale, 2)
+        if k in right:
+            mask = cv2.resize((instances == tied[k]).astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
+            _tint(picture, cv2.GaussianBlur(mask, (0, 0), 0.7 * scale[0]), colors[int(identity[tied[k]])])
+        else:
+            corners(picture, box, WRONG if k in wrong else INK, 2 if k in wrong else 1)
+    for k in filled:
+        if k in right:
+            u0, v0, u1, v1 = claims.boxes[k] * np.tile(scale, 2)
+            outline = np.array([[u0, v0], [u1, v0], [u1, v1], [u0, v1]])
+            polyline(picture, outline, colors[int(identity[tied[k]])], 2, closed=True)
 
 
-def _field_of_view(T_world_camera: Array, fov: float, reach: float) -> Array:
-    forward = T_world_camera[:2, 2]
-    heading = np.arctan2(forward[1], forward[0]) + np.linspace(-fov / 2, fov / 2, 24)
-    edge = T_world_camera[:2, 3] + reach * np.stack([np.cos(heading), np.sin(heading)], axis=1)
-    return np.concatenate([T_world_camera[None, :2, 3], edge])
+def _tint(picture: Image, mask: NDArray[Any], color: Color) -> None:
+    """A veil of colour over a soft mask (H, W), stronger along its outline."""
+    rim = np.clip(1.6 - 4 * np.abs(mask - 0.5), 0, 1)
+    blend(picture, np.clip(4 * mask - 1.5, 0, 1), color, 0.22)
+    blend(picture, rim, color, 0.5)
 
 
-def _rectangle(position: Array, heading: float, extent: Array) -> Array:
-    half = 0.5 * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * extent[:2]
-    c, s = np.cos(heading), np.sin(heading)
-    return position + half @ np.array([[c, s], [-s, c]])
+def matched_slots(robot: int, score: StepScore) -> tuple[set[int], set[int]]:
+    """Slots of one robot that are in some right match, and those that are only in wrong ones."""
+    right: set[int] = set()
+    wrong: set[int] = set()
+    for pair in score.pairs:
+        if robot in (pair.a, pair.b):
+            slots = pair.assertions[:, 0 if robot == pair.a else 1]
+            right |= set(slots[pair.hits].tolist())
+            wrong |= set(slots[~pair.hits].tolist())
+    return right, wrong - right
 
 
-def _fixed(points: Array) -> NDArray[np.int32]:
-    """Pixels with four fractional bits, for smooth outlines."""
-    return np.round(np.clip(points, -1e4, 1e4) * 16).astype(np.int32)
-
-
-def _round_length(metres: float) -> float:
-    power = 10.0 ** np.floor(np.log10(metres))
-    return float(power * max(k for k in (1, 2, 5) if k * power <= metres))
-
-
-def draw_correspondences(images: list[Image], claims: list[Any], result: StepScore, title: str) -> Image:
+def draw_correspondences(images: Sequence[Image], claims: Sequence[Claims], result: StepScore, title: str) -> Image:
     """The paper's Fig. 6: two cameras side by side, boxes, right matches in green, wrong ones in dashed red.
 
     Args:
@@ -140,54 +187,36 @@ def draw_correspondences(images: list[Image], claims: list[Any], result: StepSco
     """
     (pair,) = [p for p in result.pairs if (p.a, p.b) == (0, 1)]
     scale = 2
-    panels = [cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_LINEAR) for image in images[:2]]
+    panels = [cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC) for image in images[:2]]
     offset = panels[0].shape[1] + GAP
-    picture = _beside(panels)
+    picture = beside(panels)
     matched = [set(pair.assertions[:, side].tolist()) for side in (0, 1)]
     centres: list[Array] = []
     for side, claim in enumerate(claims[:2]):
-        shift = np.array([side * offset, 0, side * offset, 0])
-        boxes = claim.boxes * scale + shift
+        boxes = claim.boxes * scale + np.array([side * offset, 0, side * offset, 0])
         centres.append(0.5 * (boxes[:, :2] + boxes[:, 2:]))
         for k in np.flatnonzero(claim.filled()):
-            u0, v0, u1, v1 = np.round(boxes[k]).astype(int)
-            cv2.rectangle(picture, (u0, v0), (u1, v1), robot_color(side) if k in matched[side] else FAINT, 2)
-        label(picture, f"robot_{side}", (side * offset, 0), robot_color(side))
+            if k in matched[side]:
+                u0, v0, u1, v1 = boxes[k]
+                outline = np.array([[u0, v0], [u1, v0], [u1, v1], [u0, v1]])
+                polyline(picture, outline, robot_color(side), 2, closed=True)
+            else:
+                corners(picture, boxes[k], INK)
+        plate(picture, f"robot_{side}", (side * offset + 8, 8), robot_color(side))
     for (k, j), hit in sorted(zip(pair.assertions.tolist(), pair.hits.tolist(), strict=True), key=lambda x: x[1]):
         start, end = centres[0][k], centres[1][j]
         if hit:
-            cv2.line(picture, _point(start), _point(end), RIGHT, 2, cv2.LINE_AA)
+            polyline(picture, np.stack([start, end]), RIGHT, 2)
         else:
-            _dashed(picture, start, end, WRONG)
+            dashes(picture, start, end, WRONG)
         for point in (start, end):
-            cv2.circle(picture, _point(point), 4, RIGHT if hit else WRONG, -1, cv2.LINE_AA)
+            disc(picture, point, 4, RIGHT if hit else WRONG)
     counts = pair.counts
-    caption = f"{title}: {counts.correct} right of {counts.retrieved} matched, {counts.common} objects detected by both"
-    head = np.full((26, picture.shape[1], 3), PAPER, dtype=np.uint8)
-    text(head, caption, (8, 18), 0.5)
-    return np.concatenate([head, picture])
-
-
-def _point(xy: Array) -> tuple[int, int]:
-    return round(float(xy[0])), round(float(xy[1]))
-
-
-def _dashed(picture: Image, start: Array, end: Array, color: Color) -> None:
-    steps = max(int(np.linalg.norm(end - start) // 7), 1)
-    for k in range(0, steps, 2):
-        a = start + (end - start) * (k / steps)
-        b = start + (end - start) * (min(k + 1, steps) / steps)
-        cv2.line(picture, _point(a), _point(b), color, 2, cv2.LINE_AA)
-
-
-def _beside(parts: list[Image]) -> Image:
-    gap = np.full((parts[0].shape[0], GAP, 3), PAPER, dtype=np.uint8)
-    return np.concatenate([x for part in parts for x in (part, gap)][:-1], axis=1)
-
-
-def _below(parts: list[Image]) -> Image:
-    gap = np.full((GAP, parts[0].shape[1], 3), PAPER, dtype=np.uint8)
-    return np.concatenate([x for part in parts for x in (part, gap)][:-1], axis=0)
+    head = blank(picture.shape[1], 36)
+    u = 2 + text(head, title, (2, 25), 18, INK, True)
+    words = f"{counts.correct} right of {counts.retrieved} matched, {counts.common} objects detected by both"
+    text(head, words, (u + 14, 25), 15, FAINT)
+    return _framed(np.concatenate([head, picture]))
 
 
 class Window:
@@ -205,11 +234,13 @@ class Window:
         self._surface = pygame.display.set_mode(size)
 
     def draw(self, picture: Image) -> None:
+        """Show the picture now."""
         self._surface.blit(self._pygame.surfarray.make_surface(picture.swapaxes(0, 1)), (0, 0))
         self._pygame.display.flip()
         self._pygame.event.pump()
 
     def close(self) -> None:
+        """Close the window."""
         self._pygame.display.quit()
 
 
