@@ -31,6 +31,7 @@ SIMULATION_HZ = 15
 SUBSTEPS = 3
 STATE_COLUMNS = ("speed_m_s", "yaw_rate_rad_s", "lane_offset_m", "lane_heading_rad", "speed_limit_m_s")
 MAX_TRIES = 30
+GIVE_WAY_M_S2 = -4.0
 GROUNDS = ((104, 118, 84), (118, 120, 96), (122, 116, 104), (96, 110, 92))
 FOOTPRINTS = ((12.0, 9.0), (9.0, 9.0), (15.0, 10.0), (10.0, 8.0))
 FLOORS = (3, 5, 4, 2)
@@ -168,10 +169,19 @@ class ConnectedDrivingWorld:
     # --- beyond the protocol -----------------------------------------------------------------------------------------
 
     def idm_controls(self) -> Array:
-        """Controls (N, 2) that highway-env's IDM driver would give the connected vehicles now; changes nothing."""
+        """Controls (N, 2) of a careful driver: highway-env's IDM that also gives way; privileged, changes nothing.
+
+        The IDM only sees who is ahead on its lane. This driver brakes as well for whoever would meet it within 3 s
+        along both routes and is not behind it.
+        """
         episode = self._running()
-        advice = np.array(episode.road.advice()).reshape(-1, 2)[[v in episode.connected for v in episode.road.vehicles]]
-        return np.clip(advice * [1.0, -1.0] / [self.params.max_acceleration, self.params.max_steering_rad], -1.0, 1.0)
+        vehicles, advice = episode.road.vehicles, np.array(episode.road.advice())
+        for pair in episode.road.conflicts():
+            for ego, other in (pair, pair[::-1]):
+                if vehicles[ego] in episode.connected and _must_give_way(vehicles[ego], vehicles[other]):
+                    advice[ego, 0] = min(advice[ego, 0], GIVE_WAY_M_S2)
+        mine = advice[[vehicles.index(vehicle) for vehicle in episode.connected]]
+        return np.clip(mine * [1.0, -1.0] / [self.params.max_acceleration, self.params.max_steering_rad], -1.0, 1.0)
 
     def save_state(self) -> Any:
         """An opaque copy of the whole state; `restore_state` continues from it bit-identically."""
@@ -275,13 +285,13 @@ class ConnectedDrivingWorld:
             if len(episode.road.vehicles) >= self.params.n_vehicles:
                 return
             lane, (begin, end) = lanes[int(rng.choice(len(lanes), p=weights / weights.sum()))]
-            self._add_vehicle(episode, lane, float(rng.uniform(begin, end)), gap=13.0)
+            self._add_vehicle(episode, lane, float(rng.uniform(begin, end)), gap=9.0)
 
     def _add_vehicle(self, episode: _Episode, lane: tuple[str, str, int], longitudinal: float, gap: float) -> None:
         """Add one vehicle of the traffic, unless another is nearer than `gap` m."""
         rng, road = episode.rng, episode.road
         where = self.map.network.get_lane(lane)
-        speed = float((where.speed_limit or 10.0) * rng.uniform(0.6, 0.9))
+        speed = float(rng.uniform(*self.map.traffic_speed))
         kind = draw_kind(rng)
         if not _far_from(road.vehicles, where.position(longitudinal, 0.0), gap):
             return
@@ -305,26 +315,39 @@ class ConnectedDrivingWorld:
     def _place_connected(self, episode: _Episode) -> bool:
         """Put the connected vehicles at their starts and clear what is too close; False when there is no room."""
         rng, road = episode.rng, episode.road
-        starts: list[Start] = list(self.map.starts)
-        if self.map.shuffled:
-            starts = [starts[int(k)] for k in rng.permutation(len(starts))]
-        for n in range(self.n_robots):
-            start = starts[n % len(starts)]
-            longitudinal = float(rng.uniform(*start.longitudinal)) - (n // len(starts)) * self.map.queue_gap_m
-            speed = float(rng.uniform(*self.map.speed))
+        convoys: dict[Start, tuple[float, float, str | None]] = {}  # last one's longitudinal and speed, and their goal
+        for _ in range(self.n_robots):
+            start = self._draw_start(rng, list(convoys))
+            if start in convoys:
+                longitudinal, speed, goal = convoys[start]
+                longitudinal -= float(rng.uniform(0.68, 0.9)) * self.map.queue_gap_m
+            else:
+                longitudinal, speed = float(rng.uniform(*start.longitudinal)), float(rng.uniform(*self.map.speed))
+                goal = str(rng.choice(start.destinations)) if start.destinations else None
+            convoys[start] = longitudinal, speed, goal
             vehicle = ConnectedVehicle.make_on_lane(road, start.lane, longitudinal, speed)
-            if not _far_from(episode.connected, vehicle.position, 7.0):
+            if not _far_from(episode.connected, vehicle.position, 6.5):
                 return False
             self._enroll(episode, vehicle, CAR)
+            vehicle.cruise_speed = self.map.cruise_speed
+            # Connected vehicles know of each other: they keep a platoon's gaps.
+            vehicle.DISTANCE_WANTED, vehicle.TIME_WANTED = 6.5, 0.5
             vehicle.target_speed = vehicle.lane.speed_limit or 10.0
-            if start.destinations:
-                vehicle.plan_route_to(str(rng.choice(start.destinations)))
+            if goal is not None:
+                vehicle.plan_route_to(goal)
             road.vehicles = [
                 v for v in road.vehicles if v in episode.connected or _far_from([v], vehicle.position, 11.0)
             ]
             road.vehicles.append(vehicle)
             episode.connected.append(vehicle)
         return not touching(_cars(episode.connected), episode.street.solids).any()
+
+    def _draw_start(self, rng: np.random.Generator, used: list[Start]) -> Start:
+        """A fresh start, or with probability `same_approach_share` (or for want of a fresh one) one used before."""
+        fresh = [start for start in self.map.starts if start not in used]
+        if used and (not fresh or rng.uniform() < self.params.same_approach_share):
+            return used[int(rng.integers(len(used)))]
+        return fresh[int(rng.integers(len(fresh)))]
 
     def _obstacle_positions(self) -> list[Array]:
         return [to_world(position) for position in self.map.obstacles]
@@ -367,6 +390,13 @@ def _safe_to_cross(point: Array, vehicles: Array) -> bool:
         if abs(beside) < 7.0 and -4.0 < ahead < speed * speed / 5.0 + 8.0 and speed > 0.5:
             return False
     return True
+
+
+def _must_give_way(ego: ConnectedVehicle, other: TrafficVehicle) -> bool:
+    """Whether `ego` brakes for `other`, with which it is in conflict; of two connected vehicles the later one does."""
+    if isinstance(other, ConnectedVehicle) and other.identity > ego.identity:
+        return False
+    return other.speed > 0.5 and float(ego.front_distance_to(other)) > 0.0
 
 
 def _far_from(vehicles: list[Any], position: Array, distance_m: float) -> bool:

@@ -49,10 +49,10 @@ class RoadMap:
         obstacles: (k, 2) m, highway-env's own obstacles.
         entries: lanes on which traffic appears, each with the nodes it may go to (empty: it follows the road).
         populated: lanes that carry traffic at the start, each with its range along the lane (m).
-        starts: groups of starts; vehicles of one group see the same place from different sides. The first N (shuffled
-            where `shuffled`) are used, further rounds start `queue_gap_m` behind.
-        shuffled: whether the order of `starts` is drawn anew at every reset.
+        starts: where connected vehicles may start; several at one start follow each other, up to `queue_gap_m` apart.
         speed: (m/s) of connected vehicles at the start.
+        traffic_speed: (m/s) that the others drive at and aim for.
+        cruise_speed: (m/s) that the IDM does not exceed when it drives a connected vehicle.
         driving_style: IDM constants that highway-env's own environment of this name sets.
         view: (x0, y0, x1, y1) m, the part of the map that is furnished and drawn.
         crossings: pedestrian crossings, (c, 2, 2) m, from pavement to pavement; crossing k lies on the arm of entry k.
@@ -66,8 +66,9 @@ class RoadMap:
     entries: tuple[tuple[LaneIndex, tuple[str, ...]], ...]
     populated: tuple[tuple[LaneIndex, tuple[float, float]], ...]
     starts: tuple[Start, ...]
-    shuffled: bool
     speed: tuple[float, float]
+    traffic_speed: tuple[float, float]
+    cruise_speed: float
     driving_style: dict[str, float]
     view: tuple[float, float, float, float]
     crossings: Array
@@ -107,13 +108,15 @@ def intersection() -> RoadMap:
         obstacles=np.zeros((0, 2)),
         entries=tuple(zip(approach, away, strict=True)),
         populated=tuple((lane, (20.0, 100.0)) for lane in approach),
-        starts=tuple(Start(lane, (70.0, 86.0), goals) for lane, goals in zip(approach, away, strict=True)),
-        shuffled=True,
-        speed=(3.0, 8.0),
+        starts=tuple(Start(lane, (66.0, 86.0), goals) for lane, goals in zip(approach, away, strict=True)),
+        speed=(1.0, 4.0),
+        traffic_speed=(6.0, 9.0),
+        cruise_speed=4.0,
         driving_style={"DISTANCE_WANTED": 9.0, "COMFORT_ACC_MAX": 6.0, "COMFORT_ACC_MIN": -3.0},
         view=(-75.0, -75.0, 75.0, 75.0),
         crossings=np.array(crossings),
         focus=(0.0, 0.0),
+        queue_gap_m=10.0,
     )
 
 
@@ -146,8 +149,9 @@ def roundabout() -> RoadMap:
         entries=tuple(entries),
         populated=tuple(on_ring) + tuple((lane, (70.0, 127.0)) for lane, _ in entries),
         starts=tuple(Start((f"{a}es", f"{a}e", 0), (-2.0, 8.0), goals) for a, goals in zip(arms, away, strict=True)),
-        shuffled=True,
         speed=(3.0, 8.0),
+        traffic_speed=(7.0, 11.0),
+        cruise_speed=5.0,
         driving_style={},
         view=(-85.0, -85.0, 85.0, 85.0),
         crossings=crossings,
@@ -156,7 +160,7 @@ def roundabout() -> RoadMap:
 
 
 def highway() -> RoadMap:
-    """Four lanes in one direction; the furnished stretch is 600 m long."""
+    """Four lanes in one direction in dense, slow traffic; the furnished stretch is 600 m long."""
     road = _road_of(HighwayEnv, "_create_road", lanes_count=4)
     lanes: list[LaneIndex] = [("0", "1", k) for k in range(4)]
     return RoadMap(
@@ -165,20 +169,21 @@ def highway() -> RoadMap:
         regulated=False,
         obstacles=np.zeros((0, 2)),
         entries=(),
-        populated=tuple((lane, (90.0, 260.0)) for lane in lanes),
+        populated=tuple((lane, (95.0, 215.0)) for lane in lanes),
         starts=tuple(Start(lanes[k], (118.0, 138.0)) for k in (3, 1, 2, 0)),
-        shuffled=False,
-        speed=(22.0, 26.0),
-        driving_style={},
+        speed=(8.0, 11.0),
+        traffic_speed=(8.0, 13.0),
+        cruise_speed=11.0,
+        driving_style={"DISTANCE_WANTED": 8.5, "TIME_WANTED": 0.8},
         view=(40.0, -30.0, 640.0, 42.0),
         crossings=np.zeros((0, 2, 2)),
         focus=(158.0, 6.0),
-        queue_gap_m=30.0,
+        queue_gap_m=18.0,
     )
 
 
 def merge() -> RoadMap:
-    """A two-lane road that a ramp joins."""
+    """A two-lane road that a ramp joins, in dense traffic."""
     road = _road_of(MergeEnv)
     lanes: list[LaneIndex] = [("a", "b", 0), ("a", "b", 1), ("j", "k", 0)]
     return RoadMap(
@@ -187,19 +192,20 @@ def merge() -> RoadMap:
         regulated=False,
         obstacles=np.array([o.position for o in road.objects]),
         entries=tuple((lane, ()) for lane in lanes),
-        populated=((lanes[0], (100.0, 228.0)), (lanes[1], (100.0, 228.0)), (lanes[2], (90.0, 148.0))),
+        populated=((lanes[0], (110.0, 215.0)), (lanes[1], (110.0, 215.0)), (lanes[2], (100.0, 148.0))),
         starts=(
             Start(lanes[2], (122.0, 136.0)),
             Start(lanes[1], (128.0, 142.0)),
             Start(lanes[0], (118.0, 132.0)),
         ),
-        shuffled=False,
-        speed=(14.0, 18.0),
-        driving_style={},
+        speed=(7.0, 10.0),
+        traffic_speed=(7.0, 12.0),
+        cruise_speed=10.0,
+        driving_style={"DISTANCE_WANTED": 8.5, "TIME_WANTED": 0.8},
         view=(40.0, -30.0, 460.0, 45.0),
         crossings=np.zeros((0, 2, 2)),
         focus=(165.0, 6.0),
-        queue_gap_m=26.0,
+        queue_gap_m=16.0,
     )
 
 
@@ -219,8 +225,9 @@ def racetrack() -> RoadMap:
         entries=(),
         populated=tuple(populated),
         starts=(Start(("a", "b", 0), (14.0, 26.0)), Start(("a", "b", 1), (6.0, 18.0))),
-        shuffled=True,
         speed=(5.0, 8.0),
+        traffic_speed=(6.0, 9.0),
+        cruise_speed=7.0,
         driving_style={},
         view=(-45.0, -75.0, 145.0, 45.0),
         crossings=np.zeros((0, 2, 2)),

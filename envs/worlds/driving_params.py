@@ -16,12 +16,12 @@ Tint = tuple[float, float, float]
 
 CAR, VAN, TRUCK, BUS, PEDESTRIAN, SIGNAL, SIGN = range(7)
 CLASSES = (
-    ObjectClass("car", 1.3),
-    ObjectClass("van", 1.5),
-    ObjectClass("truck", 2.0),
-    ObjectClass("bus", 2.3),
-    ObjectClass("pedestrian", 0.2),
-    ObjectClass("traffic light", 0.15),
+    ObjectClass("car", 1.1),
+    ObjectClass("van", 1.45),
+    ObjectClass("truck", 2.1),
+    ObjectClass("bus", 3.0),
+    ObjectClass("pedestrian", 0.1),
+    ObjectClass("traffic light", 0.1),
     ObjectClass("road sign", 0.05),
 )
 PERSON_SIZE: Size = (0.66, 0.66, 1.76)
@@ -80,6 +80,7 @@ class DrivingParams:
         prewarm_s: traffic runs this long before the connected vehicles appear (s).
         n_parked, n_pedestrians, n_signals, n_signs: other objects.
         n_buildings, n_trees: scenery that hides objects.
+        same_approach_share: chance that a connected vehicle follows another one instead of coming from elsewhere.
         crossing_share: share of pedestrians that want to cross the road, on maps with crossings.
         look_alike_fraction: share of objects whose look is drawn from the few common ones.
         street_spread_m: standard deviation of street objects' distance from the map's focus.
@@ -95,19 +96,20 @@ class DrivingParams:
     max_vehicles: int = 18
     spawn_probability: float = 0.3
     prewarm_s: float = 3.0
-    n_parked: int = 16
-    n_pedestrians: int = 14
+    n_parked: int = 18
+    n_pedestrians: int = 40
     n_signals: int = 8
-    n_signs: int = 8
+    n_signs: int = 10
     n_buildings: int = 14
     n_trees: int = 16
+    same_approach_share: float = 0.8
     crossing_share: float = 0.4
-    look_alike_fraction: float = 0.8
-    street_spread_m: float = 20.0
+    look_alike_fraction: float = 0.97
+    street_spread_m: float = 17.0
     times_of_day: tuple[str, ...] = DAYTIME
-    horizontal_fov_rad: float = float(np.pi / 2)
-    camera_height_m: float = 1.5
-    camera_forward_m: float = 0.5
+    horizontal_fov_rad: float = 1.3
+    camera_height_m: float = 2.0
+    camera_forward_m: float = 0.3
     max_acceleration: float = 5.0
     max_steering_rad: float = 0.6
 
@@ -121,7 +123,7 @@ class DrivingParams:
                 raise ValueError(f"{name} must be a whole number, not negative, got {value!r}")
         if self.n_vehicles > self.max_vehicles:
             raise ValueError(f"n_vehicles {self.n_vehicles} exceeds max_vehicles {self.max_vehicles}")
-        for name in ("spawn_probability", "look_alike_fraction", "crossing_share"):
+        for name in ("spawn_probability", "look_alike_fraction", "crossing_share", "same_approach_share"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)}")
         if not 0 <= self.prewarm_s <= 60:
@@ -151,7 +153,7 @@ def draw_paint(rng: np.random.Generator, kind: int, look_alike_fraction: float) 
     """Mesh and tint of a vehicle: a common one with that probability, else any mesh of its kind in a rare paint."""
     meshes = KINDS[kind].meshes
     if rng.uniform() < look_alike_fraction:
-        return meshes[0], draw(rng, COMMON_PAINTS)
+        return meshes[0], draw(rng, COMMON_PAINTS if kind == CAR else COMMON_PAINTS[:1])
     return int(rng.choice(meshes)), draw(rng, RARE_PAINTS)
 
 
@@ -165,11 +167,42 @@ def draw(rng: np.random.Generator, tints: tuple[Tint, ...]) -> Tint:
     return tints[int(rng.integers(len(tints)))]
 
 
-PRESETS = {
-    "easy": {"n_vehicles": 8, "n_parked": 6, "n_pedestrians": 6, "n_buildings": 6, "look_alike_fraction": 0.4},
+PRESETS: dict[str, dict[str, float]] = {
+    "easy": {
+        "n_vehicles": 8,
+        "n_parked": 6,
+        "n_pedestrians": 16,
+        "n_buildings": 6,
+        "n_trees": 8,
+        "same_approach_share": 1.0,
+        "look_alike_fraction": 0.4,
+    },
     "paper": {},
-    "hard": {"n_vehicles": 18, "max_vehicles": 22, "n_parked": 22, "n_pedestrians": 22, "look_alike_fraction": 0.95},
+    "hard": {
+        "n_vehicles": 18,
+        "max_vehicles": 22,
+        "n_parked": 24,
+        "n_pedestrians": 50,
+        "same_approach_share": 0.3,
+        "look_alike_fraction": 1.0,
+        "camera_height_m": 1.5,
+    },
 }
+"""What each preset changes of the defaults, which are the paper's."""
+
+MAP_COUNTS: dict[str, dict[str, float]] = {
+    "highway": {
+        "n_vehicles": 34,
+        "max_vehicles": 36,
+        "n_parked": 14,
+        "n_pedestrians": 14,
+        "n_signals": 4,
+        "n_signs": 14,
+        "street_spread_m": 35.0,
+    },
+    "merge": {"n_vehicles": 24, "max_vehicles": 28, "n_pedestrians": 18, "n_signs": 14, "street_spread_m": 30.0},
+}
+"""Roads with one pavement get less street and more traffic, for as many objects a view; not applied by `easy`."""
 
 
 def preset(name: str, map: str = "intersection") -> DrivingParams:
@@ -180,4 +213,5 @@ def preset(name: str, map: str = "intersection") -> DrivingParams:
     """
     if name not in PRESETS:
         raise ValueError(f"unknown preset {name!r}; connected_driving has {', '.join(PRESETS)}")
-    return DrivingParams(map=map, **PRESETS[name])  # type: ignore[arg-type]
+    counts = {} if name == "easy" else MAP_COUNTS.get(map, {})
+    return DrivingParams(map=map, **{**PRESETS[name], **counts})  # type: ignore[arg-type]

@@ -279,7 +279,7 @@ class Street:
             return Walker(path, start, pace, float(rng.uniform(-1.0, 1.0)), k, float(rng.uniform(0.0, 3.0)))
         if not ground.pavements:
             return None
-        paths = [self._weights(path, 1.0) for path in ground.pavements]
+        paths = [self._weights(path, 0.7) for path in ground.pavements]
         totals = np.array([weights.sum() for weights in paths])
         k = int(rng.choice(len(paths), p=totals / totals.sum()))
         at = float(rng.choice(len(paths[k]), p=paths[k] / totals[k]))

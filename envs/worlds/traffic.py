@@ -71,11 +71,26 @@ class TrafficVehicle(IDMVehicle):
 
 
 class ConnectedVehicle(TrafficVehicle):
-    """A vehicle that we drive: it holds our acceleration and steering, and still knows its route."""
+    """A vehicle that we drive: it holds our acceleration and steering, and still knows its route.
+
+    Attributes:
+        cruise_speed: m/s that an IDM driver would not exceed in it, whatever highway-env's rules set.
+    """
+
+    cruise_speed = math.inf
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.enable_lane_change = False
+
+    @property
+    def target_speed(self) -> float:
+        """m/s that an IDM driver would like to go."""
+        return self._target_speed
+
+    @target_speed.setter
+    def target_speed(self, speed: float) -> None:
+        self._target_speed = min(speed, self.cruise_speed)
 
     def act(self, action: dict[str, float] | None = None) -> None:
         """Hold `action`; without one, only keep following the route (highway-env's road calls this)."""
@@ -199,6 +214,12 @@ class FastRoad(RegulatedRoad):
         accelerations, steering = idm_commands(bodies[:n], seen)
         return list(zip(accelerations.tolist(), steering.tolist(), strict=True))
 
+    def conflicts(self) -> list[tuple[int, int]]:
+        """Pairs of vehicles that would meet within 3 s along their routes at their present speeds."""
+        lanes = self.network.table
+        table, routes = vehicle_table(self.vehicles, lanes), route_table(self.vehicles, lanes)
+        return [(i, j) for i, j in predicted_conflicts(lanes.rows, table, routes, LOOK_AHEAD_S).tolist()]
+
     def _bodies(self) -> tuple[Array, Array]:
         """The table of vehicles and obstacles, and their directions from the lanes' centres."""
         bodies = np.vstack([vehicle_table(self.vehicles, self.network.table), obstacle_table(self.objects)])
@@ -233,10 +254,7 @@ class FastRoad(RegulatedRoad):
     def enforce_road_rules(self) -> None:
         """Find conflicts and let one of each two yield: `RegulatedRoad.enforce_road_rules`."""
         self._release_yielding()
-        lanes = self.network.table
-        routes = route_table(self.vehicles, lanes)
-        conflicts = predicted_conflicts(lanes.rows, vehicle_table(self.vehicles, lanes), routes, LOOK_AHEAD_S)
-        for i, j in conflicts.tolist():
+        for i, j in self.conflicts():
             yielding = self.respect_priorities(self.vehicles[i], self.vehicles[j])
             yielding.color = self.YIELDING_COLOR
             yielding.target_speed = 0
