@@ -14,11 +14,21 @@ __all__ = ["Detections", "Perceptor", "SimulatedPerception", "SimulatedPerceptio
 
 
 def make_perceptor(name: str, env: CollaborativeEnv) -> Perceptor:
-    """Eyes for an environment: `simulated`.
+    """Eyes for an environment: `simulated`, or `learned` with the weights that come with the package.
 
     Raises:
-        ValueError: no perception of that name.
+        ValueError: no perception of that name; classes that the weights do not know.
+        ImportError: `learned` without the packages of the extra `learned`.
+        covis.agents.perception.weights.WeightsError: weights are missing or altered.
     """
     if name == "simulated":
         return SimulatedPerception(env.world.classes)
-    raise ValueError(f"no perception is called {name!r}; there is simulated")
+    if name == "learned":
+        try:
+            from .learned import LearnedPerception
+        except ImportError as error:
+            raise ImportError(
+                f"learned perception needs torch and safetensors: install covis[learned] ({error})"
+            ) from error
+        return LearnedPerception(env.classes, image_size=(env.width, env.height))
+    raise ValueError(f"no perception is called {name!r}; there are simulated, learned")

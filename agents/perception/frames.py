@@ -22,7 +22,6 @@ from ...envs.worlds import driving
 from ...envs.worlds.lighting import TIMES_OF_DAY, sample_light
 from ...envs.worlds.world import Snapshot, World
 from ...matching.pose import Array, invert, transform
-from ..controllers import scripted_controls
 from .targets import ObjectTable, object_table
 
 TRAINING_KEY, VALIDATION_KEY, TEST_KEY = 7_100_001, 7_200_001, 7_300_001
@@ -62,11 +61,11 @@ def training_variants(scenes: tuple[str, ...] = tuple(SCENES)) -> tuple[Variant,
     """What is trained on: every preset and map but those held out, `paper` twice as often."""
     share = {"easy": 1.0, "paper": 2.0, "hard": 1.0}
     scene_weight = {"connected_driving": 1.4}
-    maps = {"intersection": 4.0, "roundabout": 2.0, "highway": 1.0, "merge": 1.0}
+    maps: dict[str | None, float] = {"intersection": 4.0, "roundabout": 2.0, "highway": 1.0, "merge": 1.0}
     out = []
     for scene in scenes:
         total = scene_weight.get(scene, 1.0)
-        places: dict[str | None, float] = dict(maps) if scene == "connected_driving" else {None: 1.0}
+        places: dict[str | None, float] = maps if scene == "connected_driving" else {None: 1.0}
         items = [
             Variant(scene, p, m, share[p] * w)
             for p in PRESETS
@@ -188,7 +187,7 @@ class FrameSource:
         world, rasterizer, class_index = self._world(variant)
         world.reset(rng)
         for _ in range(int(rng.integers(0, 6))):
-            world.step(scripted_controls(world))
+            world.step(_wandering(world, rng))
         for _ in range(self.snapshots):
             snapshot = world.snapshot()
             if rng.random() < 0.25:
@@ -214,8 +213,10 @@ class FrameSource:
 
 
 def _wandering(world: World, rng: np.random.Generator) -> Array:
-    """Scripted controls with some noise, so that robots come to stand where their scripts never take them."""
-    controls = scripted_controls(world)
-    if world.ends_on_collision:
-        return controls
-    return np.clip(controls + rng.normal(0, 0.5, controls.shape), -1, 1)
+    """Controls (N, d) that move robots about: traffic drives as it should, others go roughly forward."""
+    drivers = getattr(world, "idm_controls", None)
+    if drivers is not None:
+        return np.asarray(drivers())
+    controls = rng.normal(0, 0.6, (world.n_robots, world.control_size))
+    controls[:, 0] += 0.3
+    return np.clip(controls, -1, 1)

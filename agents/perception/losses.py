@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ...envs.camera.effects import EffectRanges, expose
 from .frames import Frame
 from .network import (
     FINE_STRIDE,
@@ -160,23 +161,19 @@ def _object_rows(frame: Frame, obj: int, rng: np.random.Generator) -> dict[str, 
     }
 
 
+EFFECTS = EffectRanges()
+"""What cameras add to pictures; the lens stays straight, since geometry and truth are those of a pinhole."""
+
+
 def vary(images: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Images (b, H, W, 3) under other light, colour, noise and sharpness."""
-    out = np.empty_like(images)
-    for i, image in enumerate(images):
-        x = image.astype(np.float32)
-        if rng.random() < 0.2:
-            blurred = x.copy()
-            blurred[:, 1:-1] = 0.25 * (x[:, :-2] + 2 * x[:, 1:-1] + x[:, 2:])
-            x = blurred
-            x[1:-1] = 0.25 * (blurred[:-2] + 2 * blurred[1:-1] + blurred[2:])
-        if rng.random() < 0.8:
-            gain = np.exp(rng.normal(0, 0.12) + rng.normal(0, 0.04, 3)).astype(np.float32)
-            contrast = float(np.exp(rng.normal(0, 0.1)))
-            x = (x - 128) * (contrast * gain) + 128 * gain + float(rng.normal(0, 6))
-        if rng.random() < 0.5:
-            x += float(abs(rng.normal(0, 4))) * rng.standard_normal(x.shape, dtype=np.float32)
-        out[i] = np.clip(x, 0, 255)
+    """Images (b, H, W, 3) as other cameras would take them: exposure, colour, contrast, blur, vignette, noise.
+
+    One in three stays as it was rendered.
+    """
+    out = images.copy()
+    for picture in out:
+        if rng.random() < 2 / 3:
+            expose(picture, EFFECTS.sample(rng), rng, out=picture)
     return out
 
 

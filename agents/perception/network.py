@@ -1,10 +1,10 @@
 """The network behind the learned eyes: one backbone pass per image, then small heads on the objects' cells alone.
 
-A residual backbone (strides 2 to 32) and a light feature pyramid give features at stride 4. From them come a heat map of
-visible centres at stride 2 (by pixel shuffle), and mask features at stride 2. At each centre a small head gives class, box,
-place of the projected 3-D centre, appearance, and the weights of that object's own mask head (dynamic masks, since
-grouping pixels by predicted offsets was the bottleneck of earlier trials). At pixels of each object another small head
-gives the depth of the object's centre and its log-variance.
+A residual backbone (strides 2 to 32) and a light feature pyramid give features at stride 4. From them come a heat map
+of visible centres at stride 2 (by pixel shuffle), and mask features at stride 2. At each centre a small head gives
+class, box, place of the projected 3-D centre, appearance, and the weights of that object's own mask head (dynamic
+masks, since grouping pixels by predicted offsets was the bottleneck of earlier trials). At pixels of each object
+another small head gives the depth of the object's centre and its log-variance.
 
 Monte Carlo dropout (section 3.3) sits in these late heads only: the backbone runs once, and T samples of the
 heads are one batch over the objects' cells.
@@ -78,7 +78,8 @@ class NetworkParams:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> NetworkParams:
-        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+        plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+        return cls(**plain)
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +190,8 @@ class Eyes(nn.Module):
 
     def _initialise(self) -> None:
         heat = self.to_heat[-1]
-        assert isinstance(heat, nn.Conv2d) and heat.bias is not None
+        assert isinstance(heat, nn.Conv2d)
+        assert heat.bias is not None
         nn.init.constant_(heat.bias, -5.0)
         nn.init.normal_(heat.weight, std=0.01)
         nn.init.normal_(self.object_out.weight, std=0.02)

@@ -1,0 +1,340 @@
+"""Eyes that see only pixels: sections 3.1, 3.3.1 and 3.3.2 with a compact network and Monte Carlo dropout."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+from ...matching import ObjectGraph
+from ...matching.pose import Array
+from . import weights as stored
+from .decode import draw_masks, find_peaks, full_masks, mask_quality, spread_pixels, suppress
+from .detections import Detections, ray_covariances, rays
+from .network import (
+    FINE_STRIDE,
+    REFERENCE_FOCAL_PX,
+    DenseFeatures,
+    Eyes,
+    Geometry,
+    NetworkParams,
+    boxes_from,
+    centre_features,
+    depth_features,
+    normalised,
+)
+
+
+@dataclass(frozen=True)
+class LearnedPerceptionParams:
+    """How the network's outputs become detections.
+
+    Attributes:
+        samples: T of Eq. (6); 1 switches dropout off, and epistemic variance with it.
+        score: least confidence of a detection.
+        candidates: most peaks looked at per image.
+        min_pixels: least visible pixels of a detection.
+        depth_pixels: pixels per object over which depth is averaged, spread evenly over its mask.
+        max_iou, max_inside: a mask goes when a better one overlaps it more, see `decode.suppress`.
+    """
+
+    samples: int = 16
+    score: float = 0.3
+    candidates: int = 64
+    min_pixels: int = 40
+    depth_pixels: int = 16
+    max_iou: float = 0.5
+    max_inside: float = 0.75
+
+    def __post_init__(self) -> None:
+        for name in ("samples", "candidates", "min_pixels", "depth_pixels"):
+            value = getattr(self, name)
+            if not isinstance(value, (int, np.integer)) or value < 1:
+                raise ValueError(f"{name} must be a whole number >= 1, got {value!r}")
+        for name in ("score", "max_iou", "max_inside"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)}")
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Everything the eyes make of one image, n objects, best score first.
+
+    Attributes:
+        detections: as the pipeline takes them.
+        scores: (n,) confidence that this is an object, in [0, 1].
+        pixels: (n,) visible pixels.
+        depth: (n,) m, of each object's centre along the optical axis.
+        depth_variance: (n,) m^2 of that, calibrated; the sum of epistemic and aleatoric.
+        depth_epistemic: (n,) m^2, the variance between samples, calibrated alike.
+        milliseconds: time per stage.
+    """
+
+    detections: Detections
+    scores: Array
+    pixels: NDArray[np.int64]
+    depth: Array
+    depth_variance: Array
+    depth_epistemic: Array
+    milliseconds: Mapping[str, float]
+
+
+class LearnedPerception:
+    """A perceptor for observations with `image`, `intrinsics` and `up`; nothing privileged is read.
+
+    Args:
+        classes: the scene's classes, in the order of the attribute vector; each must be one the network knows.
+        weights: trained weights; None loads those that come with the package.
+        params: how outputs become detections.
+        image_size: (width, height) that images must have; None takes any.
+
+    Attributes:
+        last: what was seen last, with scores, timing and the parts of the uncertainty.
+
+    Raises:
+        WeightsError: no weights, or altered ones.
+        ValueError: a class that the network does not know.
+    """
+
+    def __init__(
+        self,
+        classes: Sequence[str],
+        weights: stored.Weights | None = None,
+        params: LearnedPerceptionParams | None = None,
+        image_size: tuple[int, int] | None = None,
+    ) -> None:
+        weights = stored.load() if weights is None else weights
+        self.params = params or LearnedPerceptionParams()
+        self.calibration = weights.calibration
+        self.image_size = image_size
+        known = weights.classes
+        unknown = [c for c in classes if c not in known]
+        if unknown or not classes:
+            raise ValueError(f"learned perception does not know the class {unknown or classes!r}; it knows {known}")
+        self.classes = tuple(classes)
+        self._class_index = torch.tensor([known.index(c) for c in classes])
+        self.network = build(weights)
+        self.last: Seen | None = None
+
+    @classmethod
+    def from_folder(cls, folder: Path, classes: Sequence[str], **options: Any) -> LearnedPerception:
+        """Eyes with the weights of a folder, see `covis.agents.perception.weights`."""
+        return cls(classes, stored.load(folder), **options)
+
+    def __call__(self, observation: Mapping[str, Any], rng: np.random.Generator) -> Detections:
+        """Detections of one observation; `rng` feeds the dropout.
+
+        Raises:
+            ValueError: no image, or one of the wrong type or size.
+        """
+        self.last = self.see(observation, rng)
+        return self.last.detections
+
+    @torch.inference_mode()
+    def see(self, observation: Mapping[str, Any], rng: np.random.Generator) -> Seen:
+        """Like calling, with all there is to know."""
+        clock = _Clock()
+        image = self._checked(observation)
+        height, width = image.shape[:2]
+        K = np.asarray(observation["intrinsics"], dtype=np.float64)
+        up = np.asarray(observation["up"], dtype=np.float64)
+        geometry = Geometry.of(torch.from_numpy(K[None]), torch.from_numpy(up[None]))
+        generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+
+        dense = self.network(normalised(torch.from_numpy(image[None])), geometry)
+        clock.lap("backbone")
+        found = self._find(dense, geometry, height, width)
+        clock.lap("masks")
+        attributes, v = self._classify(found.features, generator)
+        clock.lap("classes")
+        depth, variance, epistemic = self._depths(dense, geometry, found, generator)
+        clock.lap("depth")
+        graph = self._graph(found, attributes, v, depth, variance, K, up, (width, height))
+        clock.lap("graph")
+        detections = Detections(graph, found.tight, found.masks)
+        return Seen(detections, found.scores, found.pixels, depth, variance, epistemic, clock.laps)
+
+    def _checked(self, observation: Mapping[str, Any]) -> NDArray[np.uint8]:
+        if "image" not in observation:
+            raise ValueError('learned perception needs the observation\'s "image": make the environment with it')
+        image = np.asarray(observation["image"])
+        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+            raise ValueError(f"image must be uint8 of shape (H, W, 3), got {image.dtype} {image.shape}")
+        height, width = image.shape[:2]
+        if self.image_size is not None and (width, height) != self.image_size:
+            raise ValueError(f"image must be {self.image_size[0]}x{self.image_size[1]} pixels, got {width}x{height}")
+        if width < 64 or height < 64 or width % FINE_STRIDE**2 or height % FINE_STRIDE**2:
+            raise ValueError(f"image sides must be multiples of 4 and at least 64 pixels, got {width}x{height}")
+        return np.ascontiguousarray(image)
+
+    def _find(self, dense: DenseFeatures, geometry: Geometry, height: int, width: int) -> _Found:
+        """Objects with their masks, the better of two claims to one thing kept."""
+        p = self.params
+        cells, peak = find_peaks(torch.sigmoid(dense.heat[0]).numpy(), 0.5 * p.score)
+        best = np.argsort(-peak, kind="stable")[: p.candidates]
+        cells, peak = cells[best], peak[best]
+        at = torch.from_numpy((FINE_STRIDE * (cells[:, ::-1] + 0.5)).astype(np.float32))
+        image = torch.zeros(len(at), dtype=torch.int64)
+        features = centre_features(dense, geometry, image, at)
+        out = self.network.objects(features)
+        boxes = boxes_from(out.box, at)
+        size = (boxes[:, 2:] - boxes[:, :2]).clamp(min=2.0)
+        region = _region(boxes.numpy(), size.numpy(), height, width)
+        logits = draw_masks(
+            dense.mask[0].numpy(),
+            out.mask.numpy(),
+            self.network.params.mask_hidden,
+            at.numpy(),
+            (0.5 * size).numpy(),
+            region,
+            FINE_STRIDE,
+        )
+        covered, quality = mask_quality(logits, region)
+        scores = np.sqrt(peak.astype(np.float64) * quality)
+        keep = suppress(logits, region, covered, scores, p.max_iou, p.max_inside)
+        keep = keep[scores[keep] >= p.score]
+        masks, pixels, tight = full_masks(logits[keep], region[keep], height, width)
+        seen = pixels >= p.min_pixels
+        rows = torch.from_numpy(keep[seen])
+        return _Found(
+            features=features[rows],
+            at=at[rows],
+            boxes=boxes[rows],
+            centre=out.centre[rows],
+            centre_log_variance=out.centre_log_variance[rows],
+            embedding=out.embedding[rows],
+            scores=scores[keep[seen]],
+            masks=masks[seen],
+            pixels=pixels[seen],
+            tight=tight[seen],
+        )
+
+    def _classify(self, features: Tensor, generator: torch.Generator) -> tuple[Array, Array]:
+        """Class distributions (n, c), Eq. (6), and their uncertainty v (n,), section 3.3.1."""
+        T = self.params.samples
+        sampled = features.expand(T, *features.shape)
+        logits = self.network.class_logits(sampled, T > 1, generator)[..., self._class_index]
+        p = torch.softmax(logits / self.calibration.class_temperature, dim=2).double().numpy()
+        mean = p.mean(axis=0)  # Eq. (6)
+        epistemic = p.var(axis=0)
+        aleatoric = (p * (1 - p)).mean(axis=0)
+        return mean / mean.sum(axis=1, keepdims=True), (epistemic + aleatoric).mean(axis=1)
+
+    def _depths(
+        self, dense: DenseFeatures, geometry: Geometry, found: _Found, generator: torch.Generator
+    ) -> tuple[Array, Array, Array]:
+        """Depth (n,) m as mean over each mask, its variance (n,) as mean over its pixels, and the epistemic part."""
+        n, T, D = len(found.scores), self.params.samples, self.params.depth_pixels
+        if n == 0:
+            return np.zeros(0), np.zeros(0), np.zeros(0)
+        pixels = torch.from_numpy(spread_pixels(found.masks, found.pixels, found.tight, D))
+        image = torch.zeros(n * D, dtype=torch.int64)
+        box = found.boxes[:, None].expand(n, D, 4).reshape(-1, 4)
+        seen = depth_features(dense, geometry, image, pixels.reshape(-1, 2), box)
+        log_depth, log_variance = self.network.depth(seen.expand(T, *seen.shape), T > 1, generator)
+        z = torch.exp(log_depth.double().view(T, n, D)) * float(geometry.focal[0]) / REFERENCE_FOCAL_PX
+        aleatoric = (z**2 * torch.exp(log_variance.double().view(T, n, D))).mean(0)
+        epistemic = z.var(0, unbiased=False)
+        factor = self.calibration.depth
+        return (
+            z.mean((0, 2)).numpy(),
+            factor * (aleatoric + epistemic).mean(1).numpy(),
+            factor * epistemic.mean(1).numpy(),
+        )
+
+    def _graph(
+        self,
+        found: _Found,
+        attributes: Array,
+        v: Array,
+        depth: Array,
+        depth_variance: Array,
+        K: Array,
+        up: Array,
+        image_size: tuple[int, int],
+    ) -> ObjectGraph:
+        size = (found.boxes[:, 2:] - found.boxes[:, :2]).clamp(min=2.0)
+        pixel = (found.at + found.centre * size).double().numpy()
+        pixel_variance = np.exp(found.centre_log_variance.double().numpy()) * (size.double().numpy() ** 2).mean(axis=1)
+        ray = rays(pixel, K)
+        positions = ray * depth[:, None]
+        u = depth_variance * (ray**2).sum(axis=1)  # of the distance along the ray
+        across = (depth / K[0, 0]) ** 2 * np.maximum(pixel_variance * self.calibration.centre, 0.05)
+        return ObjectGraph(
+            positions=positions,
+            attributes=attributes,
+            position_variance=u,
+            attribute_variance=v,
+            covariances=ray_covariances(positions, u, across),
+            up=up / np.linalg.norm(up),
+            forward=np.array([0.0, 0.0, 1.0]),
+            embedding=found.embedding.double().numpy(),
+            intrinsics=K,
+            image_size=image_size,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """n objects of one image: where they are, their masks, what the heads read and said."""
+
+    features: Tensor
+    at: Tensor
+    boxes: Tensor
+    centre: Tensor
+    centre_log_variance: Tensor
+    embedding: Tensor
+    scores: Array
+    masks: NDArray[np.bool_]
+    pixels: NDArray[np.int64]
+    tight: Array
+
+
+class _Clock:
+    """Milliseconds of the stages that end with each `lap`."""
+
+    def __init__(self) -> None:
+        self.laps: dict[str, float] = {}
+        self._since = time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        now = time.perf_counter()
+        self.laps[name] = 1e3 * (now - self._since)
+        self._since = now
+
+
+def build(weights: stored.Weights) -> Eyes:
+    """The network of these weights, for inference: normalisation folded into the convolutions."""
+    network = Eyes(NetworkParams.from_dict(dict(weights.network)))
+    network.load_state_dict(dict(weights.tensors))
+    network.eval().requires_grad_(False)
+    _fold(network)
+    return network.to(memory_format=torch.channels_last)
+
+
+def _fold(module: nn.Module) -> None:
+    for child in module.children():
+        _fold(child)
+    if isinstance(module, nn.Sequential):
+        layers = list(module)
+        for i, (conv, norm) in enumerate(pairwise(layers)):
+            if isinstance(conv, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d):
+                module[i], module[i + 1] = fuse_conv_bn_eval(conv, norm), nn.Identity()
+
+
+def _region(boxes: NDArray[np.float32], size: NDArray[np.float32], height: int, width: int) -> NDArray[np.int64]:
+    """Cells [x0, y0, x1, y1) of the fine maps in which an object's mask is sought: its box with a margin."""
+    margin = 0.15 * size + 3
+    low = np.floor((boxes[:, :2] - margin) / FINE_STRIDE)
+    high = np.ceil((boxes[:, 2:] + margin) / FINE_STRIDE)
+    limit = np.array([width, height]) // FINE_STRIDE
+    return np.concatenate([np.clip(low, 0, limit), np.clip(high, 0, limit)], axis=1).astype(np.int64)

@@ -1,0 +1,108 @@
+"""What training needs of evaluation: figures on the way, and calibration of the uncertainty on validation scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..matching.pose import Array
+from .perception_benchmark import PerceptionTarget, Tally, default_targets, ence, row, tally
+
+if TYPE_CHECKING:
+    from ..agents.perception.network import Eyes
+    from ..agents.perception.training import State, TrainingParams
+    from ..agents.perception.weights import Calibration, Weights
+
+FIGURES = ("ap50", "class_accuracy", "depth_abs_rel", "depth_spearman", "ence")
+MEDIAN_CHI_SQUARED_2 = 2 * np.log(2)
+SMALLEST_TALLY = 30
+
+
+def known_targets() -> list[PerceptionTarget]:
+    """The scenes of the training."""
+    return [target for target in default_targets() if not target.ood]
+
+
+def validation_figures(network: Eyes, images: int, seed: int = 0) -> dict[str, float]:
+    """Means over the scenes of the main figures, on validation seeds."""
+    weights = _weights(network)
+    rows = [row(target, found) for target, found in _tallies(weights, images, seed)]
+    out = {}
+    for name in FIGURES:
+        values = [r[name] for r in rows if r[name] is not None]
+        if values:
+            out[name] = float(np.mean(values))
+    return out
+
+
+def finish(state: State, params: TrainingParams, out: Path, images: int) -> Weights:
+    """Calibrate the averaged network of a training on `images` validation images a scene, and save it in `out`."""
+    from ..agents.perception import weights as stored
+
+    weights = _weights(state.averaged)
+    if images:
+        weights = replace(weights, calibration=calibrate([found for _, found in _tallies(weights, images, 1)]))
+    weights = replace(weights, notes=training_notes(state, params) | {"calibration_images_per_scene": images})
+    stored.save(weights, out)
+    return weights
+
+
+def training_notes(state: State, params: TrainingParams) -> dict[str, Any]:
+    """How the network was trained, as the manifest keeps it."""
+    return {
+        "seed": params.seed,
+        "steps": state.step,
+        "images": state.images,
+        "minutes": round(state.seconds / 60, 1),
+        "learned_from": sorted({f"{v.scene}:{v.preset}" + (f":{v.map}" if v.map else "") for v in params.variants}),
+    }
+
+
+def calibrate(tallies: Sequence[Tally]) -> Calibration:
+    """Factors on the variances, and the class temperature, that fit what uncalibrated eyes saw, scenes counting alike.
+
+    The factor on the depth's variance has the least expected normalised calibration error; that on the centre's makes
+    the median of the squared lateral error that of two Gaussian axes; the temperature has the least negative
+    log-likelihood of the true classes. Scenes with too few detections are left out.
+    """
+    from ..agents.perception.weights import Calibration
+
+    used = [t for t in tallies if len(t.of("u")) >= SMALLEST_TALLY]
+    if not used:
+        return Calibration()
+    factors = np.exp(np.linspace(np.log(0.05), np.log(20), 121))
+    errors = [np.mean([ence(f * t.of("u"), t.of("error") ** 2) or 0.0 for t in used]) for f in factors]
+    lateral = [np.median(t.of("lateral") ** 2 / t.of("across")) / MEDIAN_CHI_SQUARED_2 for t in used]
+    temperatures = np.exp(np.linspace(np.log(0.3), np.log(3), 61))
+    surprise = [np.mean([_negative_log_likelihood(t, x) for t in used]) for x in temperatures]
+    return Calibration(
+        depth=float(factors[int(np.argmin(errors))]),
+        centre=float(np.exp(np.mean(np.log(lateral)))),
+        class_temperature=float(temperatures[int(np.argmin(surprise))]),
+    )
+
+
+def _negative_log_likelihood(found: Tally, temperature: float) -> float:
+    total, number = 0.0, 0
+    for attributes, true in zip(found.attributes, found.true_class, strict=True):
+        logits: Array = np.log(np.maximum(attributes, 1e-9)) / temperature
+        logits = logits - np.logaddexp.reduce(logits, axis=1, keepdims=True)
+        total -= logits[np.arange(len(true)), true].sum()
+        number += len(true)
+    return total / max(number, 1)
+
+
+def _weights(network: Eyes) -> Weights:
+    from ..agents.perception.weights import Weights
+
+    return Weights({k: v.detach().clone() for k, v in network.state_dict().items()}, network.params.to_dict())
+
+
+def _tallies(weights: Weights, images: int, seed: int) -> list[tuple[PerceptionTarget, Tally]]:
+    from ..agents.perception.frames import VALIDATION_KEY
+
+    return [(target, tally(target, weights, images, (VALIDATION_KEY, seed))) for target in known_targets()]
