@@ -8,6 +8,7 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
+from ..fusion.sequence import PairTracker
 from ..matching import Matching, ObjectGraph, PriorRequiredError, RelativePose
 from .methods import Method, oracle, random_matching
 
@@ -24,11 +25,13 @@ def match_pair(
     prior: RelativePose | None,
     stream: tuple[int, ...],
     where: str,
+    tracker: PairTracker | None = None,
 ) -> tuple[Matching, float]:
     """The matching and the time it took, ms.
 
     `identities` serve the evaluation-only baselines alone. `stream` seeds the matcher's generator, together with the
-    method's name, so that results depend on neither the order of methods nor the number of workers.
+    method's name, so that results depend on neither the order of methods nor the number of workers. A `tracker`, after
+    its `predict`, calls the matcher itself and hands it what it knows of the relative pose.
 
     Raises:
         PriorRequiredError: the method needs a prior.
@@ -43,7 +46,10 @@ def match_pair(
     assert matcher is not None
     start = perf_counter()
     try:
-        matching = matcher(source, target, prior=prior, rng=rng, **method.options)
+        if tracker is None:
+            matching = matcher(source, target, prior=prior, rng=rng, **method.options)
+        else:
+            matching = tracker.match(matcher, source, target, rng=rng, **method.options)
     except PriorRequiredError:
         raise
     except Exception as error:

@@ -11,6 +11,7 @@ from .datasets import Dataset, Frame, View, prior_between
 from .matching_run import match_pair
 from .methods import Method
 from .records import Record
+from .sequence import PairTrackers
 from .settings import MIN_DETECTIONS, Settings
 
 
@@ -18,13 +19,18 @@ def run_episodes(
     dataset: Dataset, episodes: Sequence[int], methods: Sequence[Method], settings: Settings
 ) -> list[Record]:
     """Records of the given episodes, in order of time, pair and method."""
-    chosen = np.flatnonzero(np.isin(dataset.episode, np.asarray(episodes)))
-    return [
-        record
-        for i in chosen
-        for pair in pairs(dataset.frame(int(i)), settings.min_common)
-        for record in _match_all(dataset, pair, methods, settings)
-    ]
+    records: list[Record] = []
+    trackers = PairTrackers() if settings.sequence else None
+    for i in np.flatnonzero(np.isin(dataset.episode, np.asarray(episodes))):
+        frame = dataset.frame(int(i))
+        if trackers is not None:
+            trackers.begin(frame.episode, {view.robot: view.odometry for view in frame.views})
+        for pair in pairs(frame, 0 if trackers is not None else settings.min_common):
+            found = list(_match_all(dataset, pair, methods, settings, trackers))
+            # A tracker sees every frame; which of them are scored is another matter.
+            if n_common(pair[1], pair[2]) >= settings.min_common:
+                records += found
+    return records
 
 
 def pairs(frame: Frame, min_common: int = 0) -> Iterator[tuple[Frame, View, View]]:
@@ -42,7 +48,11 @@ def n_common(source: View, target: View) -> int:
 
 
 def _match_all(
-    dataset: Dataset, pair: tuple[Frame, View, View], methods: Sequence[Method], settings: Settings
+    dataset: Dataset,
+    pair: tuple[Frame, View, View],
+    methods: Sequence[Method],
+    settings: Settings,
+    trackers: PairTrackers | None,
 ) -> Iterator[Record]:
     frame, source, target = pair
     prior = prior_between(source, target) if settings.pose == "known" else None
@@ -57,6 +67,7 @@ def _match_all(
             prior,
             (settings.seed, frame.index, number),
             where,
+            None if trackers is None else trackers.of(method.label, source.robot, target.robot),
         )
         yield Record.of_matching(
             matching,

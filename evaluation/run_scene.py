@@ -24,6 +24,7 @@ from ..envs.scoring import PairScore, StepScore, score, tie
 from .matching_run import match_pair
 from .methods import Method
 from .records import Record
+from .sequence import PairTrackers
 from .settings import MIN_DETECTIONS, Settings
 
 
@@ -64,10 +65,13 @@ def play(env: CollaborativeEnv, episode: int, methods: Sequence[Method], setting
     """The frames of one episode; between two of them the environment stands at the instant of the first."""
     perceive = make_perceptor(settings.perception, env)
     observations, _ = env.reset(seed=[settings.seed, episode])
+    trackers = PairTrackers() if settings.sequence else None
     step = 0
     while env.agents:
         views = look_around(env, perceive, observations, (settings.seed, episode, step))
-        yield _match_frame(env, views, methods, settings, episode, step)
+        if trackers is not None:
+            trackers.begin(episode, {agent: np.asarray(o["odometry"], float) for agent, o in observations.items()})
+        yield _match_frame(env, views, methods, settings, episode, step, trackers)
         observations = step_scripted(env)
         step += 1
 
@@ -98,6 +102,7 @@ def _match_frame(
     settings: Settings,
     episode: int,
     step: int,
+    trackers: PairTrackers | None,
 ) -> SceneFrame:
     truth = env.ground_truth()
     identities = [identity(view, i, env) for i, view in enumerate(views)]
@@ -116,6 +121,7 @@ def _match_frame(
                 relative_pose(views[i], views[j]) if settings.pose == "known" else None,
                 (settings.seed, episode, step, number),
                 f"{env.name}, episode {episode}, step {step}, robots {i} and {j}",
+                None if trackers is None else trackers.of(method.label, f"robot_{i}", f"robot_{j}"),
             )
         said = claims(views, found, env.max_detections)
         frame.matchings[method.label] = found

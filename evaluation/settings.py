@@ -39,6 +39,8 @@ class Settings:
             raise ValueError(f"pose must be one of {', '.join(get_args(PoseKnowledge))}, got {self.pose!r}")
         if self.perception not in get_args(Perception):
             raise ValueError(f"perception must be one of {', '.join(get_args(Perception))}, got {self.perception!r}")
+        if self.sequence and self.pose == "known":
+            raise ValueError("sequence gives the matcher a prior of its own: it goes with pose='unknown'")
         if self.min_common < 0:
             raise ValueError(f"min_common must be non-negative, got {self.min_common}")
         if self.seed < 0:
