@@ -29,7 +29,7 @@ def bcagm(
     prior: RelativePose | None = None,
     rng: np.random.Generator | None = None,
     iterations: int = 100,
-    neighbours: int | None = None,
+    neighbours_factor: float = 1.0,
     angle_width: float | None = None,
 ) -> Matching:
     """Match by the angles of triples with tensor block coordinate ascent.
@@ -38,7 +38,7 @@ def bcagm(
         source, target: the two robots' graphs, n n' <= 1024.
         prior, rng: not used.
         iterations: most rounds over the four blocks.
-        neighbours, angle_width: as in `rrwhm`.
+        neighbours_factor, angle_width: as in `rrwhm`.
 
     Returns:
         min(n, n') matches, none with fewer than 3 objects a side. A score is the match's part in T(x, x, x), relative
@@ -54,7 +54,7 @@ def bcagm(
     n, m = len(source), len(target)
     if min(n, m) < 3:
         return Matching.empty()
-    index, values = triples(source, target, neighbours, angle_width)
+    index, values = triples(source, target, neighbours_factor, angle_width)
     x = block_ascent(index, values, n, m, iterations)
     part = contract(index, values, x, x).reshape(n, m)
     return assignment(x.reshape(n, m), part / max(float((part * x.reshape(n, m)).max()), 1e-300))

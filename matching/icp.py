@@ -28,6 +28,7 @@ def icp(
     tolerance: float = 1e-6,
     gate_m: float | None = None,
     gate_sigmas: float = 3.0,
+    gate_shrink: float = 0.7,
 ) -> Matching:
     """Align the target to the source by closest points, keep the best of all restarts, and match what is left close.
 
@@ -45,6 +46,7 @@ def icp(
         gate_m: largest distance of a match after alignment, m. None: `gate_sigmas` times the root of the median
             variance of a candidate.
         gate_sigmas: see above.
+        gate_shrink: factor of the gate per iteration, until it is the final one; 0 = the final one at once.
 
     Returns:
         Objects that are each other's closest within the gate; score 1 - distance / gate.
@@ -55,6 +57,8 @@ def icp(
     check_comparable(source, target)
     if restarts < 1 or iterations < 1:
         raise ValueError(f"restarts and iterations must be at least 1, got {restarts} and {iterations}")
+    if not 0 <= gate_shrink < 1:
+        raise ValueError(f"gate_shrink must lie in [0, 1), got {gate_shrink}")
     if translations not in ("centroids", "objects"):
         raise ValueError(f"translations must be 'centroids' or 'objects', got {translations!r}")
     n, m = len(source), len(target)
@@ -69,9 +73,13 @@ def icp(
     if not gate_m > 0:
         raise ValueError(f"the gate must be positive, got {gate_m} m")
     R, t = _starts(source, target, prior, restarts, translations)
-    final_gate = gate_m if translations == "objects" and prior is None else np.inf
-    first_gate = max(final_gate, float(np.sqrt(((q - q.mean(axis=0)) ** 2).sum(axis=1).mean())) * np.pi / restarts)
-    R_best, t_best = align(p, q, R, t, iterations, tolerance, first_gate, final_gate)
+    final_gate = np.inf if translations == "centroids" and prior is None else gate_m
+    # At first, what an initial rotation half-way between two starts displaces may still pull.
+    level = source.up is not None and target.up is not None
+    spacing = np.pi / restarts if level else (np.pi**2 / restarts) ** (1 / 3)
+    first_gate = max(final_gate, spacing * float(np.sqrt(((q - q.mean(axis=0)) ** 2).sum(axis=1).mean())))
+    first_gate = first_gate if gate_shrink > 0 else final_gate
+    R_best, t_best = align(p, q, R, t, iterations, tolerance, first_gate, final_gate, gate_shrink)
     distance = np.linalg.norm(p[:, None] - (q @ R_best.T + t_best)[None], axis=2)
     rows = np.arange(n)
     cols = distance.argmin(axis=1)
@@ -121,6 +129,7 @@ def align(
     tolerance: float,
     first_gate: float,
     final_gate: float,
+    shrink: float,
 ) -> tuple[Array, Array]:
     """Rotation (3, 3) and translation (3,) of target points q (m, 3) to source points p (n, 3) with the least error.
 
@@ -140,10 +149,10 @@ def align(
             if new_error < best:
                 best = new_error
                 best_R[:], best_t[:] = R, t
-            if gate == final_gate and abs(error - new_error) <= tolerance * max(error, 1e-12):
+            if gate == final_gate and error < np.inf and abs(error - new_error) <= tolerance * max(error, 1e-12):
                 break
             error = new_error
-            gate = max(final_gate, 0.7 * gate)
+            gate = max(final_gate, shrink * gate)
             pulled = squared <= gate * gate
             if pulled.sum() < 2:
                 break

@@ -32,7 +32,7 @@ def mos(
     distance_width_m2: float | None = None,
     distance_width_factor: float = 1.0,
     angle_width: float | None = None,
-    neighbours: int | None = None,
+    neighbours_factor: float = 1.0,
     attribute_exponent: float = 1.0,
 ) -> Matching:
     """Match by attributes, distances and angles together with reweighted random walks on a hypergraph.
@@ -41,8 +41,8 @@ def mos(
         source, target: the two robots' graphs, n n' <= 1024.
         prior, rng: not used.
         order_weights: weights of the first, second and third order.
-        walk_weight, inflation, iterations, sinkhorn_iterations, tolerance, sinkhorn_tolerance, neighbours, angle_width:
-            as in `rrwhm`.
+        walk_weight, inflation, iterations, sinkhorn_iterations, tolerance, sinkhorn_tolerance, neighbours_factor,
+            angle_width: as in `rrwhm`.
         distance_width_m2, distance_width_factor: as in `rrwm`.
         attribute_exponent: power of the attribute similarity in the first order; larger trusts classes more.
 
@@ -66,7 +66,7 @@ def mos(
     pairwise = affinity_matrix(source, target, s, t, width, 0.0)
     index, values = np.zeros((0, 3), dtype=np.int32), np.zeros(0)
     if min(n, m) >= 3:
-        index, values = triples(source, target, neighbours, angle_width)
+        index, values = triples(source, target, neighbours_factor, angle_width)
     uniform = np.full(n * m, 1.0 / (n * m))
     visits = hypergraph_walk(
         _normalised(unary, order_weights[0], unary),

@@ -33,7 +33,7 @@ def rrwhm(
     sinkhorn_iterations: int = 1000,
     tolerance: float = 1e-6,
     sinkhorn_tolerance: float = 1e-3,
-    neighbours: int | None = None,
+    neighbours_factor: float = 1.0,
     angle_width: float | None = None,
 ) -> Matching:
     """Walk randomly over candidate matches along triples of them, with reweighted jumps, and assign.
@@ -43,7 +43,7 @@ def rrwhm(
         prior, rng: not used.
         walk_weight, inflation, iterations, sinkhorn_iterations, sinkhorn_tolerance: as in `rrwm`; published values.
         tolerance: the walk ends when its change (Euclidean norm) falls below.
-        neighbours: target triangles kept for each source triangle. None: n n'.
+        neighbours_factor: target triangles kept for each source triangle, in multiples of the published n n'.
         angle_width: gamma of Eq. (3). None: the mean distance of the triangles kept.
 
     Returns:
@@ -57,7 +57,7 @@ def rrwhm(
     check_walk(walk_weight, inflation, iterations, sinkhorn_iterations)
     if min(len(source), len(target)) < 3:
         return Matching.empty()
-    index, values = triples(source, target, neighbours, angle_width)
+    index, values = triples(source, target, neighbours_factor, angle_width)
     visits = hypergraph_walk(
         np.zeros(len(source) * len(target)),
         np.zeros((0, 0)),
@@ -76,12 +76,12 @@ def rrwhm(
 
 
 def triples(
-    source: ObjectGraph, target: ObjectGraph, neighbours: int | None, angle_width: float | None
+    source: ObjectGraph, target: ObjectGraph, neighbours_factor: float, angle_width: float | None
 ) -> tuple[NDArray[np.int32], Array]:
     """Sparse T: candidates (t, 3) and values (t,) in (0, 1], once per triple."""
-    neighbours = len(source) * len(target) if neighbours is None else neighbours
-    if neighbours < 1:
-        raise ValueError(f"neighbours must be at least 1, got {neighbours}")
+    if not neighbours_factor > 0:
+        raise ValueError(f"neighbours_factor must be positive, got {neighbours_factor}")
+    neighbours = max(1, round(neighbours_factor * len(source) * len(target)))
     index, distance = nearest_triples(
         vertex_cosines(source.positions), vertex_cosines(target.positions), neighbours, False
     )

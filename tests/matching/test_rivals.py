@@ -1,0 +1,298 @@
+"""Each rival against brute force or its defining property on small problems."""
+
+from itertools import combinations, permutations
+
+import numpy as np
+import pytest
+
+from covis.matching import ObjectGraph, bcagm, clipper, icp, mos, rrwhm, rrwm
+from covis.matching.bcagm import block_ascent, convexity_bound, lifted_gradient
+from covis.matching.candidates import affinity_matrix
+from covis.matching.clipper import consistency, densest_clique
+from covis.matching.icp import rigid, spread_rotations
+from covis.matching.pose import rotation_from_vector
+from covis.matching.rrwhm import triples
+from covis.matching.rrwm import reweighted_random_walk, sinkhorn
+from covis.matching.similarity import (
+    contract,
+    distances,
+    nearest_triples,
+    triangle_distance,
+    triangle_radius,
+    vertex_cosines,
+)
+from covis.matching.testing import scene
+
+
+def small(seed, n=4, noise=0.3):
+    rng = np.random.default_rng(seed)
+    p = rng.uniform(-5, 5, (n, 3))
+    shuffle = rng.permutation(n)
+    q = (p @ rotation_from_vector(np.array([0.3, -1.0, 0.8])).T + rng.normal(0, noise, p.shape))[shuffle]
+    options = {"position_variance": noise**2}
+    return ObjectGraph.from_positions(p, **options), ObjectGraph.from_positions(q, **options), np.argsort(shuffle)
+
+
+def dense(index, values, size):
+    """The symmetric tensor (size, size, size) that a list of triples stands for."""
+    T = np.zeros((size, size, size))
+    for (a, b, c), v in zip(index, values, strict=True):
+        for order in permutations((a, b, c)):
+            T[order] = v
+    return T
+
+
+def indicator(match, m):
+    x = np.zeros((len(match), m))
+    x[np.arange(len(match)), match] = 1
+    return x.ravel()
+
+
+# RRWM
+
+
+def test_sinkhorn_makes_rows_and_columns_sum_to_one():
+    X = np.random.default_rng(0).uniform(0.1, 1, (5, 5))
+    sinkhorn(X, 200)
+    np.testing.assert_allclose(X.sum(axis=0), 1, atol=1e-9)
+    np.testing.assert_allclose(X.sum(axis=1), 1, atol=1e-9)
+
+
+@pytest.mark.parametrize("shape", [(3, 5), (5, 3)])
+def test_sinkhorn_with_slack_is_sinkhorn_of_the_padded_square(shape):
+    X = np.random.default_rng(1).uniform(0.1, 1, shape)
+    n, m = shape
+    padded = np.full((5, 5), 0.2)
+    padded[:n, :m] = X
+    sinkhorn(padded, 30)
+    sinkhorn(X, 30, 0.0, 0.2)
+    np.testing.assert_allclose(X, padded[:n, :m], atol=1e-12)
+
+
+def test_walk_is_the_published_iteration_in_numpy():
+    source, target, _ = small(0)
+    K = affinity_matrix(source, target, distances(source.positions), distances(target.positions), 0.5, 1.0)
+    c, beta, steps = 0.2, 30.0, 7
+    mixed = np.full(16, 1 / 16)
+    for _ in range(steps):
+        walk = K @ mixed
+        walk /= walk.sum()
+        jump = np.exp(beta * walk / walk.max()).reshape(4, 4)
+        for _ in range(11):
+            jump /= jump.sum(axis=1, keepdims=True)
+            jump /= jump.sum(axis=0, keepdims=True)
+        mixed = c * walk + (1 - c) * jump.ravel() / jump.sum()
+    np.testing.assert_allclose(reweighted_random_walk(K, 4, 4, c, beta, steps, 11, 0.0, 0.0).ravel(), walk, atol=1e-12)
+
+
+def test_rrwm_reaches_the_optimum_of_its_affinity_on_small_problems():
+    hits = 0
+    for seed in range(30):
+        source, target, _ = small(seed)
+        K = affinity_matrix(source, target, distances(source.positions), distances(target.positions), 0.18, 1.0)
+        best = max(indicator(m, 4) @ K @ indicator(m, 4) for m in permutations(range(4)))
+        found = rrwm(source, target, distance_width_m2=0.18).pairs
+        hits += indicator(found[:, 1], 4) @ K @ indicator(found[:, 1], 4) > best - 1e-9
+    assert hits >= 24
+
+
+# Triples
+
+
+def test_nearest_triples_are_those_within_the_radius():
+    rng = np.random.default_rng(2)
+    c, d = vertex_cosines(rng.normal(size=(4, 3))), vertex_cosines(rng.normal(size=(5, 3)))
+    index, distance = nearest_triples(c, d, 7, False)
+    radius = triangle_radius(c, d, 7, False)
+    kept = {tuple(row) for row in index.tolist()}
+    for i, j, k in combinations(range(4), 3):
+        for x, y, z in permutations(range(5), 3):
+            near = triangle_distance(c, i, j, k, d, x, y, z, False) <= radius[i, j, k]
+            assert near == ((i * 5 + x, j * 5 + y, k * 5 + z) in kept)
+    for (a, b, e), far in zip(index, distance, strict=True):
+        (i, x), (j, y), (k, z) = divmod(a, 5), divmod(b, 5), divmod(e, 5)
+        assert far == pytest.approx(triangle_distance(c, i, j, k, d, x, y, z, False))
+        assert far <= radius[i, j, k]
+
+
+def test_contract_is_the_tensor_product():
+    source, target, _ = small(3)
+    index, values = triples(source, target, 0.5, None)
+    T = dense(index, values, 16)
+    x, y = np.random.default_rng(0).uniform(size=(2, 16))
+    np.testing.assert_allclose(contract(index, values, x, y), np.einsum("abc,b,c->a", T, x, y), atol=1e-12)
+
+
+@pytest.mark.parametrize("matcher", [rrwhm, bcagm])
+def test_hypergraph_methods_reach_the_optimum_of_the_tensor_on_small_problems(matcher):
+    ratios = []
+    for seed in range(30):
+        source, target, _ = small(seed)
+        index, values = triples(source, target, 1.0, None)
+        T = dense(index, values, 16)
+
+        def score(match, T=T):
+            x = indicator(match, 4)
+            return np.einsum("abc,a,b,c", T, x, x, x)
+
+        best = max(score(m) for m in permutations(range(4)))
+        found = matcher(source, target).pairs
+        ratios.append(score(found[:, 1]) / best if len(found) == 4 else 0.0)
+    assert np.mean(np.array(ratios) > 1 - 1e-9) >= 0.6
+    assert np.mean(ratios) > 0.85
+
+
+def test_lifted_form_agrees_with_its_gradient_and_ascent_never_loses_to_its_start():
+    source, target, _ = small(4)
+    index, values = triples(source, target, 1.0, None)
+    T = dense(index, values, 16)
+    rng = np.random.default_rng(1)
+    x, y, z, t = rng.uniform(size=(4, 16))
+    alpha = 0.7
+
+    def form(x):
+        F = sum(np.einsum("abc,a,b,c", T, *three) for three in ((x, y, z), (x, y, t), (x, z, t)))
+        return F + alpha * ((x @ y) * (z @ t) + (x @ z) * (y @ t) + (x @ t) * (y @ z))
+
+    np.testing.assert_allclose(x @ lifted_gradient(index, values, y, z, t, alpha), form(x), rtol=1e-12)
+    best = block_ascent(index, values, 4, 4, 50)
+    assert best.reshape(4, 4).sum(axis=0).tolist() == [1, 1, 1, 1]
+    assert convexity_bound(values, 4) > 0
+
+
+# MOS
+
+
+def test_mos_uses_every_order():
+    rng = np.random.default_rng(5)
+    p = rng.uniform(-5, 5, (5, 3))
+    kinds = np.eye(5)
+    source = ObjectGraph.from_positions(p, attributes=kinds)
+    # Attributes alone: positions say nothing.
+    other = ObjectGraph.from_positions(rng.uniform(-5, 5, (5, 3)), attributes=kinds[::-1].copy())
+    assert as_list(mos(source, other, order_weights=(1, 0, 0))) == [[i, 4 - i] for i in range(5)]
+    # Geometry alone: attributes mislead.
+    moved = ObjectGraph.from_positions(p[[2, 0, 4, 1, 3]] + 1.0, attributes=kinds)
+    truth = [[0, 1], [1, 3], [2, 0], [3, 4], [4, 2]]
+    assert as_list(mos(source, moved, order_weights=(0, 1, 0), distance_width_m2=0.1)) == truth
+    assert as_list(mos(source, moved, order_weights=(0, 0, 1), angle_width=0.1)) == truth
+    with pytest.raises(ValueError, match="order_weights must be three"):
+        mos(source, moved, order_weights=(0, 0, 0))
+
+
+def as_list(matching):
+    return sorted(matching.pairs.tolist())
+
+
+# CLIPPER
+
+
+def test_consistency_is_zero_for_conflicts_and_beyond_epsilon():
+    s = distances(np.array([[0.0, 0, 0], [1, 0, 0], [5, 0, 0]]))
+    candidates = np.argwhere(np.ones((3, 3)))
+    M = consistency(s, s, candidates, 0.2, 0.6, 0.0)
+    assert (M == M.T).all()
+    assert (np.diag(M) == 1).all()
+    assert M[0, 1] == 0  # shares source object 0
+    assert M[0, 4] == 1  # (0, 0) and (1, 1)
+    assert M[0, 5] == 0  # distance 1 against 5
+    close = consistency(s, s * 1.3, candidates, 0.2, 0.6, 0.0)
+    assert close[0, 4] == pytest.approx(np.exp(-0.5 * 0.3**2 / 0.2**2))
+    assert consistency(s, s, candidates, 0.2, 0.6, 2.0)[0, 4] == 0  # closer than the least distance
+
+
+def test_densest_clique_of_a_planted_clique():
+    rng = np.random.default_rng(0)
+    hits = 0
+    for _ in range(20):
+        A = np.triu(rng.uniform(size=(30, 30)) < 0.15, 1).astype(float)
+        planted = rng.permutation(30)[:8]
+        A[np.ix_(planted, planted)] = 1.0
+        M = np.triu(A, 1)
+        M = M + M.T + np.eye(30)
+        hits += set(densest_clique(M).tolist()) == set(planted.tolist())
+    assert hits >= 18
+
+
+def test_clipper_returns_a_clique():
+    problem = scene(np.random.default_rng(3))
+    found = clipper(problem.source, problem.target, sigma_m=0.05)
+    s, t = distances(problem.source.positions), distances(problem.target.positions)
+    difference = s[np.ix_(found.pairs[:, 0], found.pairs[:, 0])] - t[np.ix_(found.pairs[:, 1], found.pairs[:, 1])]
+    assert len(found) >= 5
+    assert np.abs(difference).max() < 0.3
+
+
+# ICP
+
+
+def test_rigid_recovers_a_motion():
+    rng = np.random.default_rng(0)
+    q = rng.normal(size=(6, 3))
+    R = rotation_from_vector(np.array([1.0, -2.0, 0.5]))
+    R_found, t_found = rigid(q @ R.T + [1.0, 2, 3], q)
+    np.testing.assert_allclose(R_found, R, atol=1e-12)
+    np.testing.assert_allclose(t_found, [1, 2, 3], atol=1e-12)
+
+
+def test_rigid_never_reflects():
+    q = np.random.default_rng(1).normal(size=(5, 3))
+    R, _ = rigid(q * [1, 1, -1], q)
+    assert np.linalg.det(R) == pytest.approx(1)
+
+
+def test_spread_rotations_cover_all_orientations():
+    R = spread_rotations(200)
+    np.testing.assert_allclose(R[0], np.eye(3), atol=1e-12)
+    for seed in range(20):
+        Q = rotation_from_vector(np.random.default_rng(seed).normal(size=3) * 2)
+        angle = np.arccos(np.clip((np.trace(R.transpose(0, 2, 1) @ Q, axis1=1, axis2=2) - 1) / 2, -1, 1))
+        assert angle.min() < np.radians(45)
+
+
+@pytest.mark.parametrize("translations", ["centroids", "objects"])
+def test_icp_aligns_views_that_overlap_throughout(translations):
+    source, target, truth = small(7, n=8, noise=0.02)
+    found = icp(source, target, translations=translations, restarts=200, gate_m=0.5)
+    assert (truth[found.pairs[:, 0]] == found.pairs[:, 1]).all()
+    assert len(found) == 8
+
+
+def test_icp_starts_from_the_prior_if_there_is_one():
+    problem = scene(np.random.default_rng(2))
+    found = icp(problem.source, problem.target, prior=problem.prior, gate_m=1.0)
+    assert (problem.truth[found.pairs[:, 0]] == found.pairs[:, 1]).all()
+    assert len(found) >= 5
+
+
+# Limits and bad options
+
+
+@pytest.mark.parametrize(("matcher", "n"), [(rrwm, 91), (clipper, 91), (rrwhm, 33), (mos, 33), (bcagm, 33), (icp, 33)])
+def test_too_many_objects_are_refused_with_the_numbers(matcher, n):
+    graph = ObjectGraph.from_positions(np.random.default_rng(0).normal(size=(n, 3)))
+    with pytest.raises(ValueError, match=f"accepts at most .* candidate matches .* got {n} x {n}"):
+        matcher(graph, graph)
+
+
+@pytest.mark.parametrize(
+    ("matcher", "options", "message"),
+    [
+        (rrwm, {"walk_weight": 1.5}, "walk_weight must lie in"),
+        (rrwm, {"iterations": 0}, "iterations must be at least 1"),
+        (rrwm, {"distance_width_m2": 0.0}, "distance width must be positive, got 0"),
+        (rrwhm, {"neighbours_factor": 0.0}, "neighbours_factor must be positive"),
+        (rrwhm, {"angle_width": -1.0}, "angle_width must be positive"),
+        (bcagm, {"iterations": 0}, "iterations must be at least 1"),
+        (clipper, {"sigma_m": -1.0}, "sigma_m and epsilon_m must be positive"),
+        (clipper, {"min_similarity": 2.0}, "min_similarity must lie in"),
+        (icp, {"restarts": 0}, "restarts and iterations must be at least 1"),
+        (icp, {"translations": "none"}, "translations must be"),
+        (icp, {"gate_m": 0.0}, "the gate must be positive"),
+        (icp, {"gate_shrink": 1.0}, "gate_shrink must lie in"),
+    ],
+)
+def test_bad_options_name_the_value(matcher, options, message):
+    graph = ObjectGraph.from_positions(np.random.default_rng(0).normal(size=(4, 3)))
+    with pytest.raises(ValueError, match=message):
+        matcher(graph, graph, **options)

@@ -1,0 +1,44 @@
+"""Our RRWM against pygmtools', step for step: same affinity, fixed iterations, its own meaning of alpha.
+
+pygmtools returns the mixture of walk and jump, ours the walk: one more step of the walk makes them the same. Its jump
+is not normalised before it is mixed (it sums to n), so its alpha weighs n alpha against 1 - alpha.
+"""
+
+import numpy as np
+import pytest
+
+from covis.matching import load_matcher
+from covis.matching.candidates import affinity_matrix
+from covis.matching.rrwm import reweighted_random_walk
+from covis.matching.similarity import distances
+from covis.matching.testing import check_matcher, scene
+
+pygm = pytest.importorskip("pygmtools", reason="pygmtools is not installed")
+
+
+@pytest.mark.parametrize("alpha", [0.2, 0.6])
+@pytest.mark.parametrize("seed", range(4))
+def test_same_walk(seed, alpha):
+    rng = np.random.default_rng(seed)
+    problem = scene(rng, common=6, source_only=2, target_only=2)
+    n = len(problem.source)
+    s, t = distances(problem.source.positions), distances(problem.target.positions)
+    K = affinity_matrix(problem.source, problem.target, s, t, 0.5, 1.0)
+    by_columns = K.reshape(n, n, n, n).transpose(1, 0, 3, 2).reshape(n * n, n * n)
+    steps, half_steps = 12, 20
+    options = {"max_iter": steps, "sk_iter": half_steps, "alpha": alpha, "beta": 30, "backend": "numpy"}
+    soft = np.asarray(pygm.rrwm(by_columns, n1=n, n2=n, **options))
+    walk = K @ soft.ravel()
+    share = (1 - alpha) / (1 - alpha + n * alpha)
+    ours = reweighted_random_walk(K, n, n, share, 30.0, steps + 1, half_steps // 2, 0.0, 0.0)
+    np.testing.assert_allclose(ours.ravel(), walk / walk.sum(), atol=1e-9)
+
+
+@pytest.mark.parametrize("solver", ["rrwm", "sm", "ipfp"])
+def test_adapter_keeps_the_contract(solver):
+    check_matcher(load_matcher(f"pygm:{solver}"), min_f1=0.5, invariant=False)
+
+
+def test_unknown_solver_is_refused_by_name():
+    with pytest.raises(ValueError, match="no pygmtools solver is called 'magic'"):
+        load_matcher("pygm:magic")
