@@ -10,6 +10,7 @@ import contextlib
 import io
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
@@ -380,7 +381,7 @@ class CocoRecords:
         self, instances: NDArray[np.int32], pixels: NDArray[np.int64], masks: NDArray[np.bool_], scores: Array
     ) -> None:
         """One image: what is true, what was found."""
-        from pycocotools import mask as coco_mask
+        from pycocotools import mask as coco_mask  # type: ignore[import-untyped]
 
         number = len(self.images) + 1
         self.images.append({"id": number, "height": instances.shape[0], "width": instances.shape[1]})
@@ -403,8 +404,8 @@ class CocoRecords:
 
     def ap50(self) -> float | None:
         """COCO's AP at IoU 0.5 of masks, objects of at least 60 visible pixels; None without such objects."""
-        from pycocotools.coco import COCO
-        from pycocotools.cocoeval import COCOeval
+        from pycocotools.coco import COCO  # type: ignore[import-untyped]
+        from pycocotools.cocoeval import COCOeval  # type: ignore[import-untyped]
 
         if not any(t["area"] >= MIN_PIXELS for t in self.truths):
             return None

@@ -34,6 +34,9 @@ def benchmark(
     json_target: Annotated[str | None, typer.Option("--json", help="Write rows to FILE; - prints them.")] = None,
 ) -> None:
     """Score matchers by precision, recall, F1, calibration and displacement error."""
+    if "perception" in targets:
+        _perception(targets, seed, json_target)
+        return
     try:
         settings = Settings(pose, preset, min_common, sequence, seed, episodes, perception)  # type: ignore[arg-type]
         methods = [Method.parse(text) for text in method or default_methods(settings)]
@@ -48,6 +51,28 @@ def benchmark(
     write_rows(rows, json_target)
     if json_target != "-":
         out.print(table(rows))
+
+
+def _perception(targets: list[str], seed: int, json_target: str | None) -> None:
+    """`covis benchmark perception`: the shipped eyes alone, on test scenes."""
+    from ..evaluation.perception_benchmark import perception_benchmark, table_columns
+
+    try:
+        if targets != ["perception"]:
+            raise ValueError(f"perception is benchmarked alone, got the targets {' '.join(targets)}")
+        with progress_bar("perception") as progress:
+            rows = perception_benchmark(seed=seed, progress=progress)
+    except (ValueError, RuntimeError) as error:
+        fail(error)
+    write_rows(rows, json_target)
+    if json_target != "-":
+        view = Table(header_style="bold")
+        for key, title in table_columns():
+            view.add_column(title, justify="left" if key == "target" else "right")
+        for row in rows:
+            cells = (row.get(key) for key, _ in table_columns())
+            view.add_row(*(c if isinstance(c, str) else "" if c is None else f"{c:.3f}" for c in cells))
+        out.print(view)
 
 
 def default_methods(settings: Settings) -> list[str]:
