@@ -13,7 +13,7 @@ NOISE_SIZE = 128
 FINE, COARSE = 48.0, 5.0
 """Cells of noise per metre of ground."""
 
-NOISE_SHIFT = 32768.0
+NOISE_SHIFT = 4096.0
 """Metres added before indexing the tile, a multiple of its period, so that indices are positive near the origin."""
 
 FAST = {"contract", "arcp", "nsz"}
@@ -67,8 +67,11 @@ def draw_background(camera, light, look, noise, shadow, contact, shadow_spans, r
             c = f32(first)
             here = depth[row, first:last]
             near_first = (ray_x + step[0] * c, ray_y + step[1] * c)
-            _ground_cells(iz_0 + iz_step * c, iz_step, near_first, step, eye, here, cells[0], cells[1])
-            _ground_shades(noise, here, cells[0], cells[1], shades)
+            if look[3] > 0.0:
+                _smooth_ground(iz_0 + iz_step * c, iz_step, near_first, step, eye, noise, here, shades)
+            else:
+                _ground_cells(iz_0 + iz_step * c, iz_step, near_first, step, eye, here, cells[0], cells[1])
+                _ground_shades(noise, here, cells[0], cells[1], shades)
             if shadow_spans[row, 1] > 0:
                 start, stop = max(first, shadow_spans[row, 0]), min(last, shadow_spans[row, 1])
                 _shade_ground(row, start, stop, first, from_sky, shadow, contact, shades)
@@ -110,6 +113,41 @@ def _ground_shades(noise, depth, fine, coarse, shades):  # type: ignore[no-untyp
     for c in range(len(depth)):
         near = min(f32(6.0) / depth[c], f32(1.0))
         shades[c] = f32(1.0) + noise[coarse[c]] * (f32(0.06) + f32(0.1) * near) + noise[fine[c]] * f32(0.16) * near
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _smooth_ground(iz_0, iz_step, ray, step, eye, noise, depth, shades):  # type: ignore[no-untyped-def]
+    """Depth and brightness of part of a row of ground, the noise interpolated where its cells would show."""
+    f32 = np.float32
+    for c in range(len(depth)):
+        z = f32(1.0) / (iz_0 + iz_step * f32(c))
+        depth[c] = z
+        reach = min(z, f32(1e4))
+        x = eye[0] + reach * (ray[0] + step[0] * f32(c))
+        y = eye[1] + reach * (ray[1] + step[1] * f32(c))
+        near = min(f32(6.0) / z, f32(1.0))
+        shade = f32(1.0) + _interpolated(x * f32(COARSE), y * f32(COARSE), noise) * (f32(0.06) + f32(0.08) * near)
+        if z < f32(5.0):
+            shade += _interpolated(x * f32(FINE), y * f32(FINE), noise) * f32(0.13) * near
+        elif z < f32(60.0):
+            mask, size = np.int32(NOISE_SIZE - 1), np.int32(NOISE_SIZE)
+            cell = (np.int32(x * f32(FINE)) & mask) + size * (np.int32(y * f32(FINE)) & mask)
+            shade += noise[np.uint32(cell)] * f32(0.13) * near
+        shades[c] = shade
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _interpolated(x, y, noise):  # type: ignore[no-untyped-def]
+    """Noise in [-1, 1] at (x, y) cells, both positive."""
+    f32 = np.float32
+    mask, size, one = np.int32(NOISE_SIZE - 1), np.int32(NOISE_SIZE), np.int32(1)
+    i, j = np.int32(x), np.int32(y)
+    s, t = x - f32(i), y - f32(j)
+    left, right = i & mask, (i + one) & mask
+    low, high = size * (j & mask), size * ((j + one) & mask)
+    lower = noise[np.uint32(low + left)] * (f32(1.0) - s) + noise[np.uint32(low + right)] * s
+    upper = noise[np.uint32(high + left)] * (f32(1.0) - s) + noise[np.uint32(high + right)] * s
+    return lower * (f32(1.0) - t) + upper * t
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)

@@ -60,7 +60,7 @@ def low_poly_team(robots: int = 15) -> tuple[tuple[Mesh, ...], Snapshot]:
 def contenders(
     width: int, height: int, *, robots: int = 15, look: Look = PLAIN, ground: bool = True
 ) -> tuple[Callable[[], object], Callable[[], object], Callable[[], None]]:
-    """Functions that take one picture (RGB, depth, ids) of the same scene, ours and TinyRenderer's; and one that closes.
+    """Functions that take one picture (RGB, depth, ids) of one scene, ours and TinyRenderer's; and a closer.
 
     Ours does all of its work, fresh arrays included. TinyRenderer's is its `getCameraImage` with shadow=0 alone: bodies
     are already placed and its depth buffer stays as it is. `ground` gives it a square of ground to draw, as ours does.

@@ -40,7 +40,7 @@ class Look:
     """What is drawn beyond shape and colour; nothing here changes depth or instances.
 
     Attributes:
-        smooth: round what is round: brightness runs smoothly over edges of less than 46 degrees.
+        smooth: round what is round (brightness runs smoothly over edges of less than 46 degrees) and smooth the ground.
         patterns: draw the meshes' patterns.
         shadows: shadows that the sun casts on the ground, and on bodies that lie flat on it.
         contact: darkness of the ground about the feet of bodies, in [0, 1].
@@ -146,7 +146,7 @@ class Rasterizer:
         self._contact = np.zeros((height, width), np.uint8)
         self._shadow_spans = self._spans.copy()
         self._shaded = own.shadows or own.contact > 0
-        self._look = np.array([own.contact, own.shadows, own.clouds])
+        self._look = np.array([own.contact, own.shadows, own.clouds, own.smooth])
         self._projected = np.empty((max(4, *(len(m.vertices) for m in meshes), 4), 5))
         self._triangles = np.empty((1024, TRIANGLE_FIELDS), np.float32)
         self._noise = _noise_tile().ravel()

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from ...matching.pose import rotation_from_vector
@@ -240,15 +241,40 @@ def corner_normals(body: Mesh, crease_rad: float = CREASE_RAD) -> Array:
     if not len(flat):
         return corners
     _, place = np.unique(np.round(body.vertices, 6), axis=0, return_inverse=True)
-    owner = np.repeat(np.arange(len(flat)), 3)
     at = place.reshape(-1)[body.faces.ravel()]
-    order = np.argsort(at, kind="stable")
-    for group in np.split(order, np.flatnonzero(np.diff(at[order])) + 1):
-        around = flat[owner[group]]
-        near = around @ around.T > np.cos(crease_rad)
-        mean = near @ around
-        corners[owner[group], group % 3] = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
+    _average_near(np.argsort(at, kind="stable"), at, flat, _corner_angles(body), np.cos(crease_rad), corners)
     return corners
+
+
+@njit(cache=True)
+def _average_near(order, place, flat, angles, least_cosine, corners):  # type: ignore[no-untyped-def]
+    """Average normals over corners at one place, weighted by their angles; `order` (3 f,) sorts corners by `place`."""
+    first = 0
+    while first < len(order):
+        last = first
+        while last < len(order) and place[order[last]] == place[order[first]]:
+            last += 1
+        for a in range(first, last):
+            i = order[a] // 3
+            x, y, z = 0.0, 0.0, 0.0
+            for b in range(first, last):
+                j = order[b] // 3
+                if flat[i, 0] * flat[j, 0] + flat[i, 1] * flat[j, 1] + flat[i, 2] * flat[j, 2] > least_cosine:
+                    w = angles[j, order[b] % 3]
+                    x, y, z = x + w * flat[j, 0], y + w * flat[j, 1], z + w * flat[j, 2]
+            length = max(np.sqrt(x * x + y * y + z * z), 1e-12)
+            k = order[a] % 3
+            corners[i, k, 0], corners[i, k, 1], corners[i, k, 2] = x / length, y / length, z / length
+        first = last
+
+
+def _corner_angles(body: Mesh) -> Array:
+    """Angle (f, 3) rad of each face at each of its corners."""
+    corners = body.vertices[body.faces]
+    to_next, to_last = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
+    lengths = np.linalg.norm(to_next, axis=2) * np.linalg.norm(to_last, axis=2)
+    cosine = np.einsum("fki,fki->fk", to_next, to_last) / np.maximum(lengths, 1e-18)
+    return np.arccos(np.clip(cosine, -1.0, 1.0))
 
 
 def pattern_axes(flat: Array) -> Array:

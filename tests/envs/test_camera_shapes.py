@@ -52,6 +52,18 @@ def test_husky_stands_on_the_ground_and_has_its_size() -> None:
     assert len(shapes.husky().faces) < 500
 
 
+@pytest.mark.parametrize("sides", [8, 12, 30])
+def test_corner_normals_of_a_cylinder_point_away_from_its_axis(sides: int) -> None:
+    body = shapes.cylinder(1.0, 2.0, sides=sides)
+    corners, flat = shapes.corner_normals(body), shapes.normals(body)
+    side = np.abs(flat[:, 2]) < 0.5
+    radial = body.vertices[body.faces[side]] * (1, 1, 0)
+    np.testing.assert_allclose(corners[side], radial, atol=1e-9)
+    np.testing.assert_allclose(corners[~side], np.repeat(flat[~side][:, None], 3, axis=1), atol=1e-12)
+    sharp = shapes.corner_normals(shapes.cylinder(1.0, 2.0, sides=6))
+    np.testing.assert_allclose(sharp, np.repeat(shapes.normals(shapes.cylinder(1.0, 2.0, sides=6))[:, None], 3, axis=1))
+
+
 def test_move_scale_paint_and_merge() -> None:
     body = shapes.translate(shapes.scale(shapes.box((1, 1, 1)), (2, 1, 1)), (0, 0, 5))
     turned = shapes.rotate(body, (0, 0, 2), np.pi / 2)
