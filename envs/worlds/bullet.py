@@ -153,8 +153,8 @@ class BoxDynamics(Engine):
         obstacle_sizes: Array,
         *,
         step_seconds: float = 0.2,
-        updates: int = 4,
-        substeps: int = 3,
+        updates: int = 2,
+        substeps: int = 4,
     ) -> None:
         """Robots (n, 2) and obstacles (k, 2) of length and width in m.
 
