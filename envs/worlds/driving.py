@@ -183,6 +183,10 @@ class ConnectedDrivingWorld:
         mine = advice[[vehicles.index(vehicle) for vehicle in episode.connected]]
         return np.clip(mine * [1.0, -1.0] / [self.params.max_acceleration, self.params.max_steering_rad], -1.0, 1.0)
 
+    def traffic(self) -> list[TrafficVehicle]:
+        """highway-env's vehicles on the road now, connected ones included, in highway-env's frame; not copies."""
+        return self._running().road.vehicles
+
     def save_state(self) -> Any:
         """An opaque copy of the whole state; `restore_state` continues from it bit-identically."""
         return self._copied(self._running())

@@ -201,6 +201,7 @@ MAP_COUNTS: dict[str, dict[str, float]] = {
         "street_spread_m": 35.0,
     },
     "merge": {"n_vehicles": 24, "max_vehicles": 28, "n_pedestrians": 18, "n_signs": 14, "street_spread_m": 30.0},
+    "racetrack": {"n_vehicles": 18, "max_vehicles": 22, "n_pedestrians": 26, "n_signals": 4, "street_spread_m": 26.0},
 }
 """Roads with one pavement get less street and more traffic, for as many objects a view; not applied by `easy`."""
 

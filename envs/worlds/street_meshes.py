@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..camera.shapes import (
+    RUBBER,
     Color,
     box,
     cone,
@@ -22,7 +23,6 @@ from ..camera.shapes import (
     side_profile,
     sphere,
     translate,
-    wheel,
 )
 from .world import Array, Mesh
 
@@ -34,14 +34,23 @@ TAILLAMP: Color = (200, 34, 30)
 
 
 def _wheels(xs: tuple[float, ...], half_track: float, radius: float) -> list[Mesh]:
-    return [wheel(radius, 0.22, (x, y, radius), sides=8) for x in xs for y in (-half_track, half_track)]
+    """Tyres with rims painted on, 20 triangles each."""
+    tyre = cylinder(radius, 0.24, RUBBER, sides=6, axis="y")
+    tyre = paint(tyre, (88, 90, 94), lambda centre, normal: np.abs(normal[:, 1]) > 0.9)
+    return [translate(tyre, (x, y, radius)) for x in xs for y in (-half_track, half_track)]
 
 
 def _lamps(front: float, back: float, half_width: float, height: float) -> list[Mesh]:
+    """Two headlamps and two tail lamps as flat panes, 2 triangles each."""
     y = half_width - 0.28
-    return [box((0.06, 0.36, 0.16), HEADLAMP, (front, side * y, height)) for side in (-1, 1)] + [
-        box((0.06, 0.3, 0.18), TAILLAMP, (back, side * y, height + 0.06)) for side in (-1, 1)
+    head = [
+        rotate(_pane(side * y, -front - 0.01, height, 0.36, 0.16, HEADLAMP), (0, 0, 1), np.pi / 2) for side in (-1, 1)
     ]
+    tail = [
+        rotate(_pane(side * y, back - 0.01, height + 0.06, 0.3, 0.18, TAILLAMP), (0, 0, 1), -np.pi / 2)
+        for side in (-1, 1)
+    ]
+    return head + tail
 
 
 def _cabin(outline: list[tuple[float, float]], width: float, roof_z: float) -> Mesh:
@@ -131,9 +140,9 @@ def person() -> Mesh:
         for side, swing in ((-1, 0.35), (1, -0.35))
     ]
     torso = prism([(-0.12, -0.17), (0.12, -0.17), (0.12, 0.17), (-0.12, 0.17)], 0.6, WHITE, top_scale=1.25)
-    head = sphere((0.11, 0.1, 0.13), skin, rings=4, sides=6, center=(0, 0, 1.6))
-    cap = sphere((0.12, 0.11, 0.09), hair, rings=4, sides=6, center=(-0.02, 0, 1.67))
-    return merge(*legs, *arms, translate(torso, (0, 0, 0.82)), head, cap)
+    head = sphere((0.12, 0.11, 0.15), skin, rings=3, sides=5, center=(0, 0, 1.61))
+    head = paint(head, hair, lambda centre, normal: (centre[:, 2] > 1.65) | (centre[:, 0] < -0.04))
+    return merge(*legs, *arms, translate(torso, (0, 0, 0.82)), head)
 
 
 def signal(lit: str) -> Mesh:
@@ -156,7 +165,7 @@ def signal(lit: str) -> Mesh:
 def sign(kind: str) -> Mesh:
     """A road sign 2.7 m high facing +x: "limit", "stop", "yield" or "info"."""
     post = cylinder(0.045, 2.2, (150, 152, 156), sides=6, center=(0, 0, 1.1))
-    face = {"limit": (16, 0.0), "stop": (8, np.pi / 8), "yield": (3, np.pi + np.pi / 3), "info": (4, np.pi / 4)}
+    face = {"limit": (10, 0.0), "stop": (8, np.pi / 8), "yield": (3, np.pi + np.pi / 3), "info": (4, np.pi / 4)}
     sides, turn = face[kind]
     rim = {"limit": (205, 30, 34), "stop": (200, 28, 30), "yield": (205, 30, 34), "info": (36, 84, 170)}[kind]
     inner = {"limit": (245, 245, 245), "stop": (214, 40, 40), "yield": (245, 245, 245), "info": (52, 108, 200)}[kind]
@@ -218,16 +227,6 @@ def _pane(x: float, y: float, z: float, width: float, height: float, color: Colo
     w, h = width / 2, height / 2
     corners = [(x - w, y, z - h), (x + w, y, z - h), (x + w, y, z + h), (x - w, y, z + h)]
     return mesh(corners, [(0, 1, 2), (0, 2, 3)], color)
-
-
-def lamp_post() -> Mesh:
-    """A street lamp 6 m high reaching over the road towards +y."""
-    steel = (120, 124, 128)
-    return merge(
-        cylinder(0.09, 6.0, steel, sides=6, center=(0, 0, 3.0)),
-        box((0.12, 1.6, 0.1), steel, (0, 0.75, 5.95)),
-        box((0.25, 0.6, 0.12), (235, 235, 220), (0, 1.4, 5.88)),
-    )
 
 
 def barrier() -> Mesh:

@@ -56,8 +56,12 @@ class TrafficVehicle(IDMVehicle):
 
     Attributes:
         identity: stable over an episode; -1 until assigned.
-        kind: index into the street's vehicle kinds.
+        kind: index into `KINDS`.
     """
+
+    # highway-env's intersection changes these on its IDMVehicle class for the whole process; ours must not notice.
+    ACC_MAX, COMFORT_ACC_MAX, COMFORT_ACC_MIN = 6.0, 3.0, -5.0
+    DISTANCE_WANTED, TIME_WANTED, DELTA = 10.0, 1.5, 4.0
 
     def __init__(self, *args: Any, identity: int = -1, kind: int = 0, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -198,18 +202,21 @@ class FastRoad(RegulatedRoad):
         if not self.vehicles:
             return
         lanes = self.network.table
-        ended = past_end(lanes.rows, *self._bodies()).tolist()
-        for vehicle, done in zip(self.vehicles, ended, strict=False):
-            if not vehicle.crashed:
-                _choose_lane(vehicle, done)
-        for vehicle, (pedal, wheel) in zip(self.vehicles, self.advice(), strict=True):
+        bodies, angles = self._bodies()
+        ended = past_end(lanes.rows, bodies, angles).tolist()
+        for k, vehicle in enumerate(self.vehicles):
+            if not vehicle.crashed and _choose_lane(vehicle, ended[k]):
+                bodies[k, V_TARGET] = lanes.row_of[vehicle.target_lane_index]
+        for vehicle, (pedal, wheel) in zip(self.vehicles, self._commands(bodies, angles), strict=True):
             if not (vehicle.crashed or isinstance(vehicle, ConnectedVehicle)):
                 vehicle.action = {"steering": wheel, "acceleration": pedal}
 
     def advice(self) -> list[tuple[float, float]]:
         """Acceleration (m/s^2) and steering (rad) that the IDM gives each vehicle on its present target lane."""
+        return self._commands(*self._bodies())
+
+    def _commands(self, bodies: Array, angles: Array) -> list[tuple[float, float]]:
         lanes, n = self.network.table, len(self.vehicles)
-        bodies, angles = self._bodies()
         seen = situations(lanes.rows, lanes.connected, lanes.offsets, bodies, n, angles)
         accelerations, steering = idm_commands(bodies[:n], seen)
         return list(zip(accelerations.tolist(), steering.tolist(), strict=True))
@@ -290,7 +297,7 @@ class FastRoad(RegulatedRoad):
         for i, j, hits, will_hit in collisions(table, n, dt).tolist():
             a, b = bodies[i], bodies[j]
             if will_hit:
-                _, _, shift = a._is_colliding(b, dt)
+                shift = translation(a.polygon(), b.polygon(), a.velocity * dt, b.velocity * dt)
                 if j >= n:
                     a.impact = shift
                 else:
@@ -299,14 +306,16 @@ class FastRoad(RegulatedRoad):
                 a.crashed = b.crashed = True
 
 
-def _choose_lane(vehicle: TrafficVehicle, ended: bool) -> None:
-    """highway-env's `follow_road` and `change_lane_policy`, entered only when they can change something."""
+def _choose_lane(vehicle: TrafficVehicle, ended: bool) -> bool:
+    """highway-env's `follow_road` and `change_lane_policy`, entered only when they can change something; whether so."""
     if ended:
         vehicle.follow_road()
     if not vehicle.enable_lane_change:
-        return
+        return ended
     if vehicle.lane_index != vehicle.target_lane_index or vehicle.timer > vehicle.LANE_CHANGE_DELAY:
         vehicle.change_lane_policy()
+        return True
+    return ended
 
 
 def vehicle_table(vehicles: list[TrafficVehicle], lanes: LaneTable) -> Array:
@@ -655,6 +664,35 @@ def rectangles_intersect(a: Array, b: Array, ax: float, ay: float, bx: float, by
             if not intersecting and not will_intersect:
                 return False, False
     return intersecting, will_intersect
+
+
+@njit(cache=True)
+def translation(a: Array, b: Array, moved_a: Array, moved_b: Array) -> Array:
+    """(2,) m by which highway-env moves colliding rectangles apart; a, b (5, 2) are its closed polygons.
+
+    The translation of `utils.are_polygons_intersecting`.
+    """
+    shortest, axis = np.inf, np.zeros(2)
+    toward_x, toward_y = a[:4, 0].mean() - b[:4, 0].mean(), a[:4, 1].mean() - b[:4, 1].mean()
+    for polygon in (a, b):
+        for k in range(4):
+            nx, ny = -polygon[k + 1, 1] + polygon[k, 1], polygon[k + 1, 0] - polygon[k, 0]
+            norm = math.sqrt(nx * nx + ny * ny)
+            nx, ny = nx / norm, ny / norm
+            a_projected, b_projected = a[:, 0] * nx + a[:, 1] * ny, b[:, 0] * nx + b[:, 1] * ny
+            min_a, max_a = a_projected.min(), a_projected.max()
+            min_b, max_b = b_projected.min(), b_projected.max()
+            moved = nx * (moved_a[0] - moved_b[0]) + ny * (moved_a[1] - moved_b[1])
+            if moved < 0:
+                min_a += moved
+            else:
+                max_a += moved
+            distance = min_b - max_a if min_a < min_b else min_a - max_b
+            if abs(distance) < shortest:
+                shortest = abs(distance)
+                sign = 1.0 if toward_x * nx + toward_y * ny > 0 else -1.0
+                axis[0], axis[1] = sign * nx, sign * ny
+    return shortest * axis
 
 
 @njit(cache=True)
