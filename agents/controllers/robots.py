@@ -192,7 +192,7 @@ class SeekView:
 
 
 def lively_controls(world: World) -> Array:
-    """Controls (N, d) for a robot scene at the present instant: a drone orbits, robots on the ground seek viewpoints.
+    """Controls (N, d) for a robot scene at the present instant: drones orbit at their altitude, others seek viewpoints.
 
     They act on the true positions of all objects, so that an episode does not depend on the method that is scored on
     it. What the partners see from where they are counts as known.
@@ -204,7 +204,7 @@ def lively_controls(world: World) -> Array:
         others = np.arange(len(s.positions)) != own
         if world.control_size == 4 and world.classes[int(s.object_class[own])].name == "drone":
             middle = s.positions[others, :2].mean(0) if others.any() else np.zeros(2)
-            orbit = Orbit((float(middle[0]), float(middle[1])), radius_m=2.5, altitude_m=7.0, speed=0.3)
+            orbit = Orbit((float(middle[0]), float(middle[1])), 4.0, max(float(T[2, 3]), 1.0), speed=0.3)
             controls[k] = orbit({"pose": T})
         else:
             scale = float(s.sizes[own, 0])  # of a robot's length
@@ -216,7 +216,8 @@ def lively_controls(world: World) -> Array:
             )
             partners = [P for j, P in enumerate(s.T_world_camera) if j != k]
             if others.any():
-                controls[k, :2] = 0.6 * seeker.best(T, s.positions[others], _known(partners, s.positions[others]))
+                best = seeker.best(T, s.positions[others], _known(partners, s.positions[others]))
+                controls[k, :2] = 0.6 * best[: world.control_size]
     return controls
 
 
