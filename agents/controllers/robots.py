@@ -14,7 +14,8 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
 
 from ...envs.worlds.world import Array, World
 from ...matching.pose import transform
@@ -156,39 +157,85 @@ class SeekView:
     def best(self, T_world_camera: Array, objects: Array, prior: Array) -> Array:
         """Forward and turn (2,) for objects (n, 3) m of covariance (n, 3, 3) m^2, world frame."""
         position, heading = planar(T_world_camera)
-        scored = []
-        for forward, turn in product((0.0, 0.5, 1.0, -0.4), (0.0, -0.4, 0.4, -1.0, 1.0)):
-            middle = heading + 0.5 * turn * self.max_turn_radps * self.horizon_s
-            way = forward * self.max_speed_mps * self.horizon_s
-            goal = position + way * np.array([math.cos(middle), math.sin(middle)])
-            if way and self._too_near(position, goal, objects):
-                continue
-            gain = self._information(goal, 2 * middle - heading, float(T_world_camera[2, 3]), objects, prior)
-            effort = 1e-3 * (abs(forward) + abs(turn))
-            scored.append((gain - effort, forward, turn))
-        _, forward, turn = max(scored, key=lambda s: s[0])
-        return np.array([forward, turn])
+        choices = np.array(list(product((0.0, 0.5, 1.0, -0.4), (0.0, -0.4, 0.4, -1.0, 1.0))))
+        turned = heading + choices[:, 1] * (self.max_turn_radps * self.horizon_s)
+        middle = 0.5 * (heading + turned)
+        way = choices[:, 0] * (self.max_speed_mps * self.horizon_s)
+        goals = position + way[:, None] * np.column_stack([np.cos(middle), np.sin(middle)])
+        gain = self.information(goals, turned, float(T_world_camera[2, 3]), objects, prior)
+        gain -= 1e-3 * np.abs(choices).sum(1)  # effort
+        gain[(way != 0) & self._too_near(position, goals, objects)] = -np.inf
+        return choices[int(np.argmax(gain))]
 
-    def _too_near(self, position: Array, goal: Array, objects: Array) -> bool:
-        after = np.hypot(*(objects[:, :2] - goal).T)
-        before = np.hypot(*(objects[:, :2] - position).T)
-        return bool(((after < self.keep_away_m) & (after < before)).any())
+    def information(self, goals: Array, headings: Array, height_m: float, objects: Array, prior: Array) -> Array:
+        """What measuring from each of (c, 2) m, looking along (c,) rad, is expected to add: (c,) nats.
 
-    def _information(self, goal: Array, heading: float, height: float, objects: Array, prior: Array) -> float:
-        ray = objects - np.array([*goal, height])
-        distance = np.maximum(np.linalg.norm(ray, axis=1), 1e-6)
-        off = np.arctan2(ray[:, 1], ray[:, 0]) - heading
-        off = np.abs(off - 2 * np.pi * np.round(off / (2 * np.pi)))
+        Without any object in view it is minus the least angle to turn in rad, less than any view is worth.
+        """
         near, far = self.range_m
-        seen = (off < 0.45 * self.horizontal_fov_rad) & (distance > near) & (distance < far)
-        if not seen.any():
-            return -float(off.min())  # nothing in view: rather turn to the nearest bearing
-        unit, r, P = ray[seen] / distance[seen, None], distance[seen], prior[seen]
-        along = 1.0 / (self.depth_noise * r) ** 2
-        across = 1.0 / (self.bearing_noise * r) ** 2
-        outer = unit[:, :, None] * unit[:, None, :]
-        information = across[:, None, None] * (np.eye(3) - outer) + along[:, None, None] * outer
-        return float(0.5 * np.linalg.slogdet(np.eye(3) + P @ information)[1].sum())
+        return view_information(
+            np.ascontiguousarray(goals),
+            headings,
+            height_m,
+            np.ascontiguousarray(objects),
+            np.ascontiguousarray(prior),
+            0.45 * self.horizontal_fov_rad,
+            near,
+            far,
+            self.depth_noise,
+            self.bearing_noise,
+        )
+
+    def _too_near(self, position: Array, goals: Array, objects: Array) -> NDArray[np.bool_]:
+        after = np.linalg.norm(objects[:, :2] - goals[:, None], axis=2)
+        before = np.linalg.norm(objects[:, :2] - position, axis=1)
+        return np.asarray(((after < self.keep_away_m) & (after < before)).any(1))
+
+
+@njit(cache=True)
+def view_information(
+    goals: Array,
+    headings: Array,
+    height_m: float,
+    objects: Array,
+    prior: Array,
+    half_fov_rad: float,
+    near_m: float,
+    far_m: float,
+    depth_noise: float,
+    bearing_noise: float,
+) -> Array:
+    """See `SeekView.information`; goals (c, 2), headings (c,), objects (n, 3), prior (n, 3, 3)."""
+    out = np.zeros(len(goals))
+    ray, M = np.zeros(3), np.zeros((3, 3))
+    for c in range(len(goals)):
+        least, seen = np.pi, False
+        for i in range(len(objects)):
+            ray[0], ray[1], ray[2] = objects[i, 0] - goals[c, 0], objects[i, 1] - goals[c, 1], objects[i, 2] - height_m
+            r = max(math.sqrt(ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2), 1e-6)
+            off = math.atan2(ray[1], ray[0]) - headings[c]
+            off = abs(off - 2 * math.pi * round(off / (2 * math.pi)))
+            least = min(least, off)
+            if off >= half_fov_rad or r <= near_m or r >= far_m:
+                continue
+            seen = True
+            across = 1.0 / (bearing_noise * r) ** 2
+            along = 1.0 / (depth_noise * r) ** 2
+            for a in range(3):
+                for b in range(3):  # M = 1 + P (across (1 - u u') + along u u')
+                    M[a, b] = 1.0 if a == b else 0.0
+                    for k in range(3):
+                        unit = across if k == b else 0.0
+                        M[a, b] += prior[i, a, k] * (unit + (along - across) * ray[k] * ray[b] / r**2)
+            det = (
+                M[0, 0] * (M[1, 1] * M[2, 2] - M[1, 2] * M[2, 1])
+                - M[0, 1] * (M[1, 0] * M[2, 2] - M[1, 2] * M[2, 0])
+                + M[0, 2] * (M[1, 0] * M[2, 1] - M[1, 1] * M[2, 0])
+            )
+            out[c] += 0.5 * math.log(max(det, 1.0))
+        if not seen:
+            out[c] = -least
+    return out
 
 
 def lively_controls(world: World) -> Array:

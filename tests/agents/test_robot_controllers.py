@@ -161,7 +161,7 @@ def test_lively_observers_gather_information() -> None:
             others = s.positions[np.arange(len(s.positions)) != k]
             prior = np.tile(np.eye(3), (len(others), 1, 1))
             position, heading = planar(T)
-            total += seek._information(position, heading, float(T[2, 3]), others, prior)
+            total += seek.information(position[None], np.array([heading]), float(T[2, 3]), others, prior)[0]
         return total
 
     for seed in range(6):
@@ -172,6 +172,29 @@ def test_lively_observers_gather_information() -> None:
         after += information()
     assert after > 1.05 * before
     world.close()
+
+
+def test_information_equals_its_numpy_reference() -> None:
+    rng = np.random.default_rng(0)
+    seek = SeekView(math.radians(80), depth_noise=0.05, bearing_noise=0.02, range_m=(1.0, 9.0))
+    objects = np.column_stack([rng.uniform(-6, 6, (12, 2)), rng.uniform(0, 1, 12)])
+    roots = rng.normal(size=(12, 3, 3))
+    prior = roots @ roots.transpose(0, 2, 1)
+    goals, headings = rng.uniform(-3, 3, (6, 2)), rng.uniform(-4, 4, 6)
+    goals[5] = (100.0, 0.0)
+    got = seek.information(goals, headings, 0.8, objects, prior)
+    for goal, heading, value in zip(goals, headings, got, strict=True):
+        ray = objects - [*goal, 0.8]
+        r = np.linalg.norm(ray, axis=1)
+        off = np.abs(np.angle(np.exp(1j * (np.arctan2(ray[:, 1], ray[:, 0]) - heading))))
+        expected = 0.0
+        seen = (off < 0.45 * math.radians(80)) & (r > 1.0) & (r < 9.0)
+        for d, distance, P in zip(ray[seen], r[seen], prior[seen], strict=True):
+            outer = np.outer(d, d) / distance**2
+            information = (np.eye(3) - outer) / (0.02 * distance) ** 2 + outer / (0.05 * distance) ** 2
+            expected += 0.5 * np.linalg.slogdet(np.eye(3) + P @ information)[1]
+        assert value == pytest.approx(expected if seen.any() else -off.min())
+    assert got[5] < 0
 
 
 def test_bad_arguments_are_named() -> None:
