@@ -105,7 +105,7 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         render_mode: `rgb_array`, `human` or None.
 
     Raises:
-        ValueError: a size, sensor or mode that does not exist.
+        ValueError: a size, sensor or mode that does not exist; a world with a single robot.
     """
 
     def __init__(
@@ -175,6 +175,8 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         self.messages = bool(messages)
         self.render_mode = render_mode
         n = self.world.n_robots
+        if n < 2:
+            raise ValueError(f"collaboration takes at least two robots, the world has {n}")
         self.possible_agents = [f"robot_{i}" for i in range(n)]
         self.agents: list[str] = []
         self.classes = tuple(c.name for c in self.world.classes)
