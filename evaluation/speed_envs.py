@@ -1,0 +1,135 @@
+"""Cameras and environments against pybullet's and highway-env's own, side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from ..agents.controllers import scripted_controls
+from ..envs.camera.comparison import contenders
+from ..envs.claims import Claims, claims_to_action
+from ..envs.collaborative import CollaborativeEnv
+from ..envs.scenes import SCENES, parallel_env
+from ..envs.worlds.driving import ConnectedDrivingWorld
+from ..envs.worlds.peers import TinyPeer, speed_params
+from .timing import rates, row
+
+N_ROBOTS = 15
+DRIVING_EPISODES = 8
+
+
+def rows(progress: Callable[[int, int], None] = lambda done, total: None) -> list[dict[str, Any]]:
+    """One row per camera size, environment and reset; `n` is the number of robots or vehicles in the scene."""
+    jobs: list[Callable[[], dict[str, Any]]] = [
+        partial(camera, 160, 120),
+        partial(camera, 320, 240),
+        partial(multi_robot, stock=True),
+        partial(multi_robot, stock=False),
+        connected_driving,
+        *(partial(reset, scene) for scene in SCENES),
+    ]
+    out = []
+    for i, job in enumerate(jobs):
+        progress(i, len(jobs))
+        out.append(job())
+    progress(len(jobs), len(jobs))
+    return out
+
+
+def camera(width: int, height: int) -> dict[str, Any]:
+    """RGB, depth and ids of 15 low-poly robots; TinyRenderer draws the same meshes with shadow=0."""
+    ours, tiny, close = contenders(width, height, robots=N_ROBOTS)
+    try:
+        mine, theirs = rates(ours, tiny)
+    finally:
+        close()
+    return row("envs", f"camera_{width}x{height}", N_ROBOTS, mine, "TinyRenderer, same meshes, shadow=0", theirs)
+
+
+def multi_robot(stock: bool) -> dict[str, Any]:
+    """Whole steps with two 160x120 cameras, against the scene as plain pybullet users build it."""
+    params = speed_params(N_ROBOTS)
+    env = parallel_env("multi_robot", params=params, width=160, height=120, max_cycles=10**9)
+    peer = TinyPeer(2, params, width=160, height=120, stock=stock)
+    controls = np.array([[0.2, 0.1], [0.2, -0.1]])
+    try:
+        env.reset(seed=0)
+        peer.reset(np.random.default_rng(0))
+        mine, theirs = rates(stepper(env, controls), lambda: peer.step(controls))
+    finally:
+        env.close()
+        peer.close()
+    if stock:
+        name, other = "multi_robot_v0", "stock Husky URDFs, wheel motors, TinyRenderer"
+    else:
+        name, other = "multi_robot_v0_like_for_like", "same box bodies and meshes, TinyRenderer"
+    return row("envs", name, N_ROBOTS, mine, other, theirs)
+
+
+def connected_driving() -> dict[str, Any]:
+    """Whole steps on the intersection with two 320x240 cameras, against bare highway-env's Kinematics observation.
+
+    Episode by episode, so that both sides have the same traffic: a twin of the scene at its reset, then as many steps.
+    """
+    from ..envs.worlds.highway_peer import bare_intersection
+
+    env = parallel_env("connected_driving")
+    nothing = Claims.empty(env.max_detections, len(env.possible_agents) - 1)
+    world = env.world
+    assert isinstance(world, ConnectedDrivingWorld)
+    mine, theirs, vehicles = [], [], []
+    try:
+        for seed in range(DRIVING_EPISODES):
+            env.reset(seed=seed)
+            peer, idle = bare_intersection(world)
+            vehicles.append(len(world.traffic()))
+            steps, start = 0, perf_counter()
+            while env.agents:
+                controls = scripted_controls(world)
+                env.step({a: claims_to_action(nothing, controls[i]) for i, a in enumerate(env.agents)})
+                steps += 1
+            middle = perf_counter()
+            for _ in range(steps):
+                peer.step(idle)
+            mine.append(steps / (middle - start))
+            theirs.append(steps / (perf_counter() - middle))
+            peer.close()
+    finally:
+        env.close()
+    # The first episode compiled.
+    return row(
+        "envs",
+        "connected_driving_v0",
+        round(float(np.mean(vehicles))),
+        float(np.median(mine[1:])),
+        "bare highway-env intersection, same traffic, Kinematics observation",
+        float(np.median(theirs[1:])),
+    )
+
+
+def reset(scene: str) -> dict[str, Any]:
+    """Resets of one environment, against building it anew for every episode."""
+    env = parallel_env(scene)
+
+    def anew() -> None:
+        fresh = parallel_env(scene)
+        fresh.reset(seed=0)
+        fresh.close()
+
+    try:
+        mine, theirs = rates(lambda: env.reset(seed=0), anew, seconds=0.5, rounds=3)
+        n = len(env.snapshot().identity)
+    finally:
+        env.close()
+    return row("envs", f"reset_{scene}", n, mine, "building the environment anew", theirs)
+
+
+def stepper(env: CollaborativeEnv, controls: Any) -> Callable[[], object]:
+    """A step with fixed controls that claims nothing."""
+    nothing = Claims.empty(env.max_detections, len(env.possible_agents) - 1)
+    actions = {a: claims_to_action(nothing, controls[i]) for i, a in enumerate(env.possible_agents)}
+    return lambda: env.step(actions)

@@ -1,0 +1,60 @@
+"""`covis speed`: rates against peers, measured alternately in one process on one thread."""
+
+from __future__ import annotations
+
+import os
+from importlib import import_module
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from ..evaluation.extras import require
+from .console import fail, out, progress_bar, write_rows
+
+AREAS = {
+    "matching": ("speed_matching", None),
+    "envs": ("speed_envs", "envs"),
+    "fusion": ("speed_fusion", None),
+    "perception": ("speed_perception", "learned"),
+}
+
+
+def speed(
+    area: Annotated[str, typer.Argument(help=f"{' | '.join(AREAS)}.")],
+    json_target: Annotated[str | None, typer.Option("--json", help="Write rows to FILE; - prints them.")] = None,
+) -> None:
+    """Rates per second against peers, side by side in this process, on one thread."""
+    if area not in AREAS:
+        fail(f"no area is called {area!r}; there are {', '.join(AREAS)}")
+    module, extra = AREAS[area]
+    # Before the libraries that read them are imported.
+    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        os.environ[variable] = "1"
+    try:
+        if extra is not None:
+            require(extra)
+        measure = import_module(f"covis.evaluation.{module}").rows
+        with progress_bar(f"speed {area}") as progress:
+            rows = measure(progress)
+    except (ValueError, RuntimeError) as error:
+        fail(error)
+    write_rows(rows, json_target)
+    if json_target != "-":
+        out.print(table(rows))
+
+
+def table(rows: list[dict[str, Any]]) -> Table:
+    view = Table(header_style="bold")
+    for title in ("what", "n", "ours", "peer's", "ratio", "peer"):
+        view.add_column(title, justify="left" if title in ("what", "peer") else "right", no_wrap=title != "peer")
+    for r in rows:
+        view.add_row(
+            r["what"],
+            "" if r["n"] is None else str(r["n"]),
+            f"{r['ours']:.4g}/s",
+            "" if r["peer_value"] is None else f"{r['peer_value']:.4g}/s",
+            "" if r["ratio"] is None else f"{r['ratio']:.1f}x",
+            r["peer"] or "",
+        )
+    return view
