@@ -185,7 +185,7 @@ def _clouds(ray_x, ray_y, ray_z, step, start, stop, strength, noise, rgb):  # ty
     f32 = np.float32
     mask = np.int32(NOISE_SIZE - 1)
     one, white = f32(1.0), f32(250.0)
-    for c in range(start, stop):
+    for c in range(start, stop, 2):
         up = ray_z + step[2] * f32(c)
         if up < f32(0.02):
             continue
@@ -201,7 +201,8 @@ def _clouds(ray_x, ray_y, ray_z, step, start, stop, strength, noise, rgb):  # ty
         amount = (upper * (one - t) + lower * t + f32(0.1)) * strength * min(one, f32(6.0) * (up - f32(0.02)))
         if amount <= f32(0.0):
             continue
+        # Clouds are soft: two pixels share one amount.
         amount = min(amount, f32(0.85))
-        for i in range(3):
-            value = f32(rgb[3 * c + i])
-            rgb[3 * c + i] = np.uint8(np.int32(value + (white - value) * amount))
+        for k in range(3 * c, 3 * min(c + 2, stop)):
+            value = f32(rgb[k])
+            rgb[k] = np.uint8(np.int32(value + (white - value) * amount))
