@@ -125,7 +125,8 @@ class Ground:
         self._roadside = np.concatenate([np.full(len(run.points), run.roadside) for run in self.runs])
         self.crossings = [_polyline(*to_world(ends)) for ends in roads.crossings]
         self._parking = self._roadside & self._parking_allowed(table)
-        self.pavements = [run.offset(WALK_M) for run in self.runs if run.roadside and len(run.points) >= 8]
+        self.pavements = [_resampled(run.offset(WALK_M)) for run in self.runs if run.roadside and len(run.points) >= 8]
+        self.pavements = [path for path in self.pavements if len(path) >= 4]
         self.posts = [post for k, path in enumerate(self.crossings) for post in self._posts(k, path)]
 
     def sites(self, outward_m: float, room_m: float, *, parking: bool = False, islands: bool = False) -> Array:
@@ -153,6 +154,13 @@ class Ground:
         half_road = np.linalg.norm(path[-1] - path[0]) / 2 - WALK_M
         heading = float(np.arctan2(away[1], away[0]))
         return [(index, middle + side * right * (half_road + POST_M) + 2.4 * away, heading) for side in (1.0, -1.0)]
+
+
+def _resampled(path: Array) -> Array:
+    """The polyline (k, 2) with samples a metre apart along it, its last shorter piece dropped."""
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
+    at = np.arange(0.0, along[-1], 1.0)
+    return np.column_stack([np.interp(at, along, path[:, 0]), np.interp(at, along, path[:, 1])])
 
 
 def _polyline(start: Array, end: Array) -> Array:

@@ -158,7 +158,7 @@ class Walker:
             self.at, self.waiting = before, 0.6
         elif not 0.0 <= self.at <= last:
             self.at, self.pace = min(max(self.at, 0.0), last), -self.pace
-            self.waiting = PAUSE_S if self.crossing >= 0 else 0.0
+            self.waiting = PAUSE_S
 
 
 class Street:

@@ -35,7 +35,7 @@ TAILLAMP: Color = (200, 34, 30)
 
 def _wheels(xs: tuple[float, ...], half_track: float, radius: float) -> list[Mesh]:
     """Tyres with rims painted on, 20 triangles each."""
-    tyre = cylinder(radius, 0.24, RUBBER, sides=6, axis="y")
+    tyre = rotate(cylinder(radius, 0.24, RUBBER, sides=6, axis="y"), (0, 1, 0), np.pi / 6)
     tyre = paint(tyre, (88, 90, 94), lambda centre, normal: np.abs(normal[:, 1]) > 0.9)
     return [translate(tyre, (x, y, radius)) for x in xs for y in (-half_track, half_track)]
 

@@ -10,8 +10,9 @@ pytest.importorskip("highway_env")
 from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road, RoadNetwork
 
-from covis.envs.worlds.driving import ConnectedDrivingWorld, DrivingParams
+from covis.envs.worlds.driving import ConnectedDrivingWorld, DrivingParams, _pedestrian_obstacle
 from covis.envs.worlds.driving_maps import MAPS, road_map
+from covis.envs.worlds.highway_peer import bare_intersection
 from covis.envs.worlds.traffic import (
     ConnectedVehicle,
     FastNetwork,
@@ -22,6 +23,7 @@ from covis.envs.worlds.traffic import (
     position_at,
     projected,
     stock_twin,
+    translation,
     vehicle_table,
 )
 
@@ -37,7 +39,7 @@ CASES = [("intersection", 12, False), *((name, 11, True) for name in MAPS)]
 
 @pytest.mark.parametrize(("name", "seed", "connected_lanes"), CASES)
 def test_trajectories_equal_highway_env(name: str, seed: int, connected_lanes: bool) -> None:
-    world = ConnectedDrivingWorld(2, DrivingParams(map=name))
+    world = ConnectedDrivingWorld(2, DrivingParams(map=name, n_vehicles=10))
     world.reset(np.random.default_rng(seed))
     fast = world._episode.road
     fast.network = FastNetwork(world.map.network, connected_lanes)
@@ -91,7 +93,51 @@ def test_collisions_equal_highway_env() -> None:
         found = {(i, j): (bool(now), bool(soon)) for i, j, now, soon in collisions(table, len(vehicles), 0.1).tolist()}
         for i, a in enumerate(vehicles):
             for j in range(i + 1, len(vehicles)):
-                now, soon, _ = a._is_colliding(vehicles[j], 0.1)
+                b = vehicles[j]
+                now, soon, shift = a._is_colliding(b, 0.1)
                 assert (now, soon) == found.get((i, j), (False, False))
+                if soon:
+                    ours = translation(a.polygon(), b.polygon(), a.velocity * 0.1, b.velocity * 0.1)
+                    assert ours.tolist() == shift.tolist()
                 hits += now
     assert hits > 50
+
+
+def test_crashes_equal_highway_env() -> None:
+    world = ConnectedDrivingWorld(2, DrivingParams(n_vehicles=10))
+    world.reset(np.random.default_rng(2))
+    fast = world._episode.road
+    a, b, c = fast.vehicles[:3]
+    b.position, b.heading, b.speed = a.position + [3.0, 1.0], a.heading + 0.7, 6.0
+    c.position, c.speed = a.position + [1.0, 6.0], 4.0
+    fast.objects = [_pedestrian_obstacle(fast, fast.vehicles[4].position + [0.5, 2.0])]
+    stock = stock_twin(fast)
+    for _ in range(45):
+        for road in (fast, stock):
+            road.act()
+            road.step(1 / 15)
+        np.testing.assert_allclose(states(fast.vehicles), states(stock.vehicles), rtol=0, atol=1e-9)
+        assert [v.crashed for v in fast.vehicles] == [v.crashed for v in stock.vehicles]
+    assert sum(v.crashed for v in fast.vehicles) >= 2
+
+
+def test_neighbours_equal_highway_env() -> None:
+    world = ConnectedDrivingWorld(2, DrivingParams(map="highway", n_vehicles=14))
+    world.reset(np.random.default_rng(4))
+    fast = world._episode.road
+    for vehicle in fast.vehicles:
+        for lane in fast.network.all_side_lanes(vehicle.lane_index):
+            assert fast.neighbour_vehicles(vehicle, lane) == Road.neighbour_vehicles(fast, vehicle, lane)
+
+
+def test_bare_intersection_has_the_same_traffic() -> None:
+    world = ConnectedDrivingWorld(2)
+    world.reset(np.random.default_rng(0))
+    env, action = bare_intersection(world)
+    assert len(env.road.vehicles) == len(world.traffic())
+    np.testing.assert_array_equal(states(env.road.vehicles)[:, :4], states(world.traffic())[:, :4])
+    observation, *_ = env.step(action)
+    assert len(observation) == 2
+    env.close()
+    with pytest.raises(ValueError, match="'merge'"):
+        bare_intersection(ConnectedDrivingWorld(2, DrivingParams(map="merge")))
