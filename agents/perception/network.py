@@ -48,7 +48,7 @@ class NetworkParams:
     """
 
     classes: tuple[str, ...]
-    widths: tuple[int, ...] = (16, 32, 64, 128, 192)
+    widths: tuple[int, ...] = (16, 32, 64, 128, 160)
     blocks: tuple[int, ...] = (1, 2, 2, 1)
     neck: int = 48
     mask_channels: int = 12
@@ -171,10 +171,9 @@ class Eyes(nn.Module):
             for i, n in enumerate(params.blocks)
         )
         self.context = nn.Linear(w[4], w[4])
-        self.lateral = nn.ModuleList(_conv(n, c, kernel=1) for n in w[1:])
+        self.lateral = nn.ModuleList(nn.Conv2d(n, c, 1) for n in w[1:])
         self.smooth = nn.ModuleList(_conv(c, c) for _ in range(2))
-        self.tower = _conv(c, c)
-        self.to_heat = nn.Sequential(_conv(c, 32), nn.Conv2d(32, FINE_STRIDE**2, 1))
+        self.to_heat = nn.Sequential(_conv(c, 24), nn.Conv2d(24, FINE_STRIDE**2, 1))
         self.to_fine = nn.Conv2d(c, FINE_STRIDE**2 * params.mask_channels, 1)
         self.from_stem = nn.Conv2d(w[0], params.mask_channels, 1)
         self.mask_mix = nn.Sequential(_conv(params.mask_channels, 16), nn.Conv2d(16, params.mask_channels, 1))
@@ -215,7 +214,6 @@ class Eyes(nn.Module):
         cells = self.smooth[1](self.lateral[0](levels[0]) + _twice(top, levels[0]))
         heat = F.pixel_shuffle(self.to_heat(cells), FINE_STRIDE)[:, 0]
         mask = self.mask_mix(F.relu(F.pixel_shuffle(self.to_fine(cells), FINE_STRIDE) + self.from_stem(stem)))
-        cells = self.tower(cells)
         return DenseFeatures(heat.float(), cells.permute(0, 2, 3, 1).float(), mask.permute(0, 2, 3, 1).float())
 
     def objects(self, found: Tensor) -> ObjectOutputs:
