@@ -14,7 +14,7 @@ from pettingzoo.utils.conversions import parallel_to_aec
 from .collaborative import CollaborativeEnv
 from .scoring import LocalizationReward
 from .sensing import PoseNoise
-from .worlds import aerial_ground, multi_robot, target_localization
+from .worlds import aerial_ground, driving_params, multi_robot, target_localization
 from .worlds.aerial_ground import AerialGroundWorld
 from .worlds.driving import ConnectedDrivingWorld
 from .worlds.multi_robot import MultiRobotWorld
@@ -43,15 +43,9 @@ class Scene:
     version: int = 0
 
 
-def _default_params(preset: str) -> Any:
-    if preset != "paper":
-        raise ValueError(f"no preset is called {preset!r} here; there is paper")
-    return None
-
-
 SCENES: dict[str, Scene] = {
     "connected_driving": Scene(
-        ConnectedDrivingWorld, _default_params, 2, PoseNoise(1.0, 0.0175), LocalizationReward(cap_m=5.0)
+        ConnectedDrivingWorld, driving_params.preset, 2, PoseNoise(1.0, 0.0175), LocalizationReward(cap_m=5.0)
     ),
     "multi_robot": Scene(
         MultiRobotWorld, multi_robot.preset, 2, PoseNoise(0.3, 0.02), LocalizationReward(cap_m=2.0)
@@ -73,7 +67,7 @@ def parallel_env(
     Args:
         scene: a name in SCENES, or `package.module:World`, a callable that takes (n_robots) or nothing.
         n_robots: robots with cameras; None = the scene's default.
-        preset: difficulty, `easy`, `paper` or `hard`; None = `paper`.
+        preset: difficulty, `easy`, `paper` or `hard`; None = the generator's own defaults. The benchmark takes `paper`.
         params: of the world's generator, instead of a preset.
         options: of `CollaborativeEnv`.
 
@@ -87,7 +81,7 @@ def parallel_env(
     spec = SCENES[scene]
     if params is not None and preset is not None:
         raise ValueError(f"give a preset or params, not both: preset={preset!r}")
-    params = spec.preset(preset or "paper") if params is None else params
+    params = spec.preset(preset) if preset is not None else params
     make_world = partial(spec.world, spec.n_robots if n_robots is None else n_robots, params)
     defaults: dict[str, Any] = {
         "name": f"{scene}_v{spec.version}",

@@ -10,10 +10,7 @@ from .engine import Unit, dataset_units, run, scene_units, target_name
 from .extras import require
 from .methods import Method
 from .records import summarise
-from .settings import Settings
-
-SCENE_NAMES = ("connected_driving", "multi_robot", "aerial_ground", "target_localization")
-"""As in `covis.envs.scenes.SCENES`, which needs the simulators; a test compares the two."""
+from .settings import SCENE_NAMES, Settings, scene_preset
 
 
 def plan(targets: Sequence[str], settings: Settings) -> list[Unit]:
@@ -60,7 +57,7 @@ def benchmark(
                 "method": method.name,
                 "options": dict(method.options),
                 "pose": settings.pose,
-                "preset": settings.preset,
+                "preset": scene_preset(name, settings),
                 "sequence": settings.sequence,
                 "min_common": settings.min_common,
                 "seed": settings.seed,

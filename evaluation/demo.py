@@ -7,11 +7,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from .benchmark import SCENE_NAMES, benchmark
+from .benchmark import benchmark
 from .engine import write_atomically
 from .extras import require
 from .methods import Method
-from .settings import Settings
+from .settings import SCENE_NAMES, Settings
 
 METHODS = ("random", "reid", "rgm", "oracle")
 EPISODES = 2

@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 
 from .datasets import FORMAT, VERSION, DatasetError, load_dataset
 from .engine import write_atomically
-from .settings import Settings
+from .settings import Settings, scene_preset
 
 FLOATS = pa.list_(pa.float64())
 ROBOTS = pa.schema(
@@ -212,14 +212,14 @@ def _meta(scene: str, env: Any, settings: Settings) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "version": VERSION,
-        "name": f"{scene}-{settings.preset or 'paper'}-seed{settings.seed}",
+        "name": "-".join(filter(None, (scene, scene_preset(scene, settings), f"seed{settings.seed}"))),
         "classes": list(env.classes),
         "sensor_frame": "camera: x right, y down, z forward",
         "units": "m",
         "pose": "world_from_sensor, row-major 4x4, noisy",
         "pose_std": {"position_m": env.pose_noise.position_m, "heading_rad": env.pose_noise.heading_rad},
         "image_size": [env.width, env.height],
-        "source": f"covis record {env.name}, preset {settings.preset or 'paper'}, seed {settings.seed}, "
+        "source": f"covis record {scene}, preset {scene_preset(scene, settings)}, seed {settings.seed}, "
         f"{settings.perception} perception",
         "licence": "CC0",
     }

@@ -25,7 +25,7 @@ from .matching_run import match_pair
 from .methods import Method
 from .records import Record
 from .sequence import PairTrackers
-from .settings import MIN_DETECTIONS, Settings
+from .settings import MIN_DETECTIONS, Settings, scene_preset
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,8 +57,9 @@ def run_episodes(scene: str, episodes: Sequence[int], methods: Sequence[Method],
 
 
 def make_env(scene: str, settings: Settings, **options: Any) -> CollaborativeEnv:
+    preset = scene_preset(scene, settings)
     sensors = ("image",) if settings.perception == "learned" else ("image", "depth", "instances")
-    return parallel_env(scene, preset=settings.preset, sensors=sensors, **options)
+    return parallel_env(scene, preset=preset, sensors=sensors, **options)
 
 
 def play(env: CollaborativeEnv, episode: int, methods: Sequence[Method], settings: Settings) -> Iterator[SceneFrame]:

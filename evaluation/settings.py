@@ -8,8 +8,16 @@ from typing import Literal, get_args
 PoseKnowledge = Literal["unknown", "known"]
 Perception = Literal["simulated", "learned"]
 
+SCENE_NAMES = ("connected_driving", "multi_robot", "aerial_ground", "target_localization")
+"""As in `covis.envs.scenes.SCENES`, which needs the simulators; a test compares the two."""
+
 MIN_DETECTIONS = 3
 """Both views of a pair need at least this many detections to count as a pair."""
+
+
+def scene_preset(target: str, settings: Settings) -> str | None:
+    """Difficulty of a target in this run: `paper` for scenes unless another is asked for; datasets have none."""
+    return settings.preset or ("paper" if target in SCENE_NAMES else None)
 
 
 @dataclass(frozen=True)
@@ -18,7 +26,7 @@ class Settings:
 
     Attributes:
         pose: `known` hands the noisy relative pose to the matcher as prior.
-        preset: difficulty of scenes; None = the scene's own default.
+        preset: difficulty of scenes; None = `paper`.
         min_common: pairs with fewer common objects are left out.
         sequence: carry a tracker's state through each episode and pass it as prior.
         seed: of shuffling, scenes and matchers.

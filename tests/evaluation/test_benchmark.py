@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from covis.evaluation import engine
-from covis.evaluation.benchmark import SCENE_NAMES, benchmark
+from covis.evaluation.benchmark import benchmark
 from covis.evaluation.datasets import DatasetError, load_dataset
 from covis.evaluation.matching_run import MatcherFailedError
 from covis.evaluation.methods import Method
-from covis.evaluation.settings import Settings
+from covis.evaluation.settings import SCENE_NAMES, Settings
 from covis.evaluation.statistics import bootstrap_f1
 from covis.matching import Matching, PriorRequiredError
 from covis.matching.metrics import Counts

@@ -1,6 +1,7 @@
 """Sequence mode: state within an episode, none across episodes, every frame seen, only the chosen ones scored."""
 
 import numpy as np
+
 from covis.evaluation import matching_run
 from covis.evaluation.benchmark import benchmark
 from covis.evaluation.methods import Method

@@ -72,8 +72,8 @@ def test_matching_imports_neither_simulators_nor_torch():
 
 @pytest.mark.slow
 def test_demo_makes_a_report(tmp_path):
-    from covis.evaluation.benchmark import SCENE_NAMES
     from covis.evaluation.demo import METHODS
+    from covis.evaluation.settings import SCENE_NAMES
 
     result = runner.invoke(app, ["demo", "--out", str(tmp_path)])
     assert result.exit_code == 0, result.output
