@@ -27,7 +27,7 @@ def clipper(
     epsilon_m: float | None = None,
     sigma_factor: float = 1.0,
     epsilon_sigmas: float = 6.0,
-    min_similarity: float = 0.0,
+    min_similarity: float = 0.5,
     min_distance_m: float = 0.0,
     min_matches: int = 1,
 ) -> Matching:

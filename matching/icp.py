@@ -27,7 +27,7 @@ def icp(
     iterations: int = 50,
     tolerance: float = 1e-6,
     gate_m: float | None = None,
-    gate_sigmas: float = 3.0,
+    gate_sigmas: float = 2.0,
     gate_shrink: float = 0.7,
 ) -> Matching:
     """Align the target to the source by closest points, keep the best of all restarts, and match what is left close.

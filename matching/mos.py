@@ -22,7 +22,7 @@ def mos(
     *,
     prior: RelativePose | None = None,
     rng: np.random.Generator | None = None,
-    order_weights: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    order_weights: tuple[float, float, float] = (1.0, 1.0, 0.3),
     walk_weight: float = 0.2,
     inflation: float = 30.0,
     iterations: int = 300,

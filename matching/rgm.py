@@ -75,8 +75,8 @@ class Similarity:
     """
 
     distance_width_m2: float | None = None
-    distance_width_factor: float = 4.0
-    angle_width: float = 0.5
+    distance_width_factor: float = 2.0
+    angle_width: float = 0.25
     attribute_uncertainty_width: float | None = None
     distance_uncertainty_width_m2: float | None = None
     angle_uncertainty_width_m2: float | None = None
@@ -159,8 +159,8 @@ def rgm(
     scaling: str = "mean",
     count_penalty: str = "squared",
     distance_width_m2: float | None = None,
-    distance_width_factor: float = 4.0,
-    angle_width: float = 0.5,
+    distance_width_factor: float = 2.0,
+    angle_width: float = 0.25,
     attribute_uncertainty_width: float | None = None,
     distance_uncertainty_width_m2: float | None = None,
     angle_uncertainty_width_m2: float | None = None,

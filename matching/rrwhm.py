@@ -33,8 +33,8 @@ def rrwhm(
     sinkhorn_iterations: int = 1000,
     tolerance: float = 1e-6,
     sinkhorn_tolerance: float = 1e-3,
-    neighbours_factor: float = 1.0,
-    angle_width: float | None = None,
+    neighbours_factor: float = 0.3,
+    angle_width: float | None = 0.3,
 ) -> Matching:
     """Walk randomly over candidate matches along triples of them, with reweighted jumps, and assign.
 

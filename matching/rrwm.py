@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from .candidates import MAX_CANDIDATES, affinity_matrix, check_size, distance_variance_m2, mean_agreement
 from .graph import Matching, ObjectGraph, check_comparable
@@ -113,8 +114,9 @@ def reweighted_random_walk(
     x = np.full(size, 1.0 / size)
     before = x.copy()
     mixed = x.copy()
+    start, column, value = sparse(affinity)
     for _ in range(iterations):
-        walk = affinity @ mixed
+        walk = multiply(start, column, value, mixed)
         total = walk.sum()
         if total <= 0.0:
             return np.zeros((n, m))
@@ -130,6 +132,43 @@ def reweighted_random_walk(
         if change < tolerance * tolerance:
             break
     return x.reshape(n, m)
+
+
+NEGLIGIBLE = 1e-12
+"""Affinities below this share of the largest are taken for zero: most distances do not agree at all."""
+
+
+@njit(cache=True)
+def sparse(K: Array) -> tuple[NDArray[np.int64], NDArray[np.int32], Array]:
+    """K (k, k) by rows: `start` (k + 1,) into columns and values of the entries that are not negligible."""
+    k = len(K)
+    least = NEGLIGIBLE * K.max()
+    start = np.zeros(k + 1, dtype=np.int64)
+    for a in range(k):
+        count = 0
+        for b in range(k):
+            count += K[a, b] > least
+        start[a + 1] = start[a] + count
+    column, value = np.empty(start[k], dtype=np.int32), np.empty(start[k])
+    for a in range(k):
+        at = start[a]
+        for b in range(k):
+            if K[a, b] > least:
+                column[at], value[at] = b, K[a, b]
+                at += 1
+    return start, column, value
+
+
+@njit(cache=True, fastmath=True)
+def multiply(start: NDArray[np.int64], column: NDArray[np.int32], value: Array, x: Array) -> Array:
+    """The sparse matrix times x (k,)."""
+    out = np.empty(len(x))
+    for a in range(len(x)):
+        total = 0.0
+        for at in range(start[a], start[a + 1]):
+            total += value[at] * x[column[at]]
+        out[a] = total
+    return out
 
 
 @njit(cache=True, fastmath=True)
