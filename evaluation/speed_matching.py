@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..matching import METHODS, ObjectGraph, RelativePose
+from ..matching import METHODS
 from ..matching.candidates import affinity_matrix
 from ..matching.rrwm import distance_width, reweighted_random_walk
 from ..matching.similarity import distances
@@ -23,8 +23,6 @@ RRWM_HALF_NORMALISATIONS = 20
 LONGEST_SOLVE_S = 10.0
 """A method is not measured at a size after one where a single solve took longer than this."""
 
-Problem = tuple[ObjectGraph, ObjectGraph, RelativePose]
-
 
 def rows(progress: Callable[[int, int], None] = lambda done, total: None) -> list[dict[str, Any]]:
     """One row per method and size it accepts; `n` is the number of objects a side.
@@ -32,13 +30,12 @@ def rows(progress: Callable[[int, int], None] = lambda done, total: None) -> lis
     The rows `rrwm_walk` compare the walks alone, ours and pygmtools', on one affinity with equal numbers of steps and
     normalisations. Where pygmtools is not installed they have no peer.
     """
-    jobs = [partial(rrwm_walk, n) for n in SIZES if n <= 50]
-    jobs += [partial(method_rows, name) for name in sorted(METHODS)]  # type: ignore[list-item]
+    jobs: list[Callable[[], list[dict[str, Any]]]] = [partial(walk_rows, n) for n in SIZES if n <= 50]
+    jobs += [partial(method_rows, name) for name in sorted(METHODS)]
     out: list[dict[str, Any]] = []
     for i, job in enumerate(jobs):
         progress(i, len(jobs))
-        found = job()
-        out.extend(found if isinstance(found, list) else [found])
+        out.extend(job())
     progress(len(jobs), len(jobs))
     return out
 
@@ -55,20 +52,27 @@ def method_rows(name: str) -> list[dict[str, Any]]:
     """Rows of one method, at every size until it refuses one or becomes too slow."""
     out = []
     for n in SIZES:
-        solves = [partial(_solve, name, problem(n, seed)) for seed in range(3)]
+        problems = [problem(n, seed) for seed in range(3)]
         try:
-            rate, _ = rates(lambda solves=solves: [solve() for solve in solves], seconds=0.2, rounds=3)
+            rate, _ = rates(partial(solve_all, name, problems), seconds=0.2, rounds=3)
         except ValueError:  # it refuses this size
             break
-        out.append(row("matching", name, n, rate * len(solves), None, None))
-        if 1 / (rate * len(solves)) > LONGEST_SOLVE_S / 8:  # the next size takes eight times as long or more
+        rate *= len(problems)
+        out.append(row("matching", name, n, rate, None, None))
+        if 1 / rate > LONGEST_SOLVE_S / 8:  # the next size takes eight times as long or more
             break
     return out
 
 
-def _solve(name: str, p: MatchingProblem) -> object:
-    prior = p.prior if name == "hungarian" else None
-    return METHODS[name](p.source, p.target, prior=prior, rng=np.random.default_rng(0))
+def solve_all(name: str, problems: list[MatchingProblem]) -> None:
+    for p in problems:
+        prior = p.prior if name == "hungarian" else None
+        METHODS[name](p.source, p.target, prior=prior, rng=np.random.default_rng(0))
+
+
+def walk_rows(n: int) -> list[dict[str, Any]]:
+    """One row: our random walk against pygmtools' on one affinity, with equal numbers of steps and normalisations."""
+    return [rrwm_walk(n)]
 
 
 def rrwm_walk(n: int) -> dict[str, Any]:

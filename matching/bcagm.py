@@ -29,8 +29,8 @@ def bcagm(
     prior: RelativePose | None = None,
     rng: np.random.Generator | None = None,
     iterations: int = 100,
-    neighbours_factor: float = 1.0,
-    angle_width: float | None = None,
+    neighbours_factor: float = 0.3,
+    angle_width: float | None = 0.3,
 ) -> Matching:
     """Match by the angles of triples with tensor block coordinate ascent.
 

@@ -25,7 +25,7 @@ def rrwm(
     tolerance: float = 3e-13,
     sinkhorn_tolerance: float = 1e-3,
     distance_width_m2: float | None = None,
-    distance_width_factor: float = 1.0,
+    distance_width_factor: float = 2.0,
     attribute_weight: float = 1.0,
 ) -> Matching:
     """Walk randomly over candidate matches, jumping to those that satisfy the one-to-one constraints, and assign.
