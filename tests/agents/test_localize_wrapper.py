@@ -1,7 +1,9 @@
 """A policy that only moves, and the scenes in Gymnasium's registry."""
 
+import importlib
 import subprocess
 import sys
+from pathlib import Path
 
 import cloudpickle
 import gymnasium
@@ -140,3 +142,10 @@ def test_gymnasium_async_vector_env():
         assert rewards.shape == (2,)
         assert infos["n_visible"].shape == (2,)
     env.close()
+
+
+def test_the_documentations_pictures_can_be_made(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[2] / "docs" / "examples"))
+    pictures = importlib.import_module("pictures")
+    pictures.save(pictures.picture("target_localization", width=64, height=48), tmp_path / "scene.png")
+    assert 1000 < (tmp_path / "scene.png").stat().st_size < 300_000
