@@ -163,20 +163,23 @@ def _ground_colors(haze, earth, far, shades, depth, rgb):  # type: ignore[no-unt
         rgb[3 * c + 2] = np.uint8(np.int32(min(earth[2] * own + far[2] * fog, f32(255.0))))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=FAST)
 def _shade_ground(row, start, stop, first, from_sky, shadow, contact, shades):  # type: ignore[no-untyped-def]
     """Darken columns start..stop - 1 of a row of ground, whose shades begin at column `first`."""
     height, width = shadow.shape
-    above, below = max(row - 1, 0), min(row + 1, height - 1)
     f32 = np.float32
+    here, above, below = shadow[row], shadow[max(row - 1, 0)], shadow[min(row + 1, height - 1)]
+    feet = contact[row]
+    sun = f32(1.0) - from_sky
     for c in range(start, stop):
-        left, right = max(c - 1, 0), min(c + 1, width - 1)
         # The mean of a cross of pixels: a soft edge.
-        covered = shadow[row, c] + shadow[row, left] + shadow[row, right] + shadow[above, c] + shadow[below, c]
-        dark = f32(contact[row, c]) * f32(1.0 / 255.0)
-        sky = from_sky * (f32(1.0) - dark)
-        sun = (f32(1.0) - from_sky) * (f32(1.0) - f32(0.19) * f32(covered)) * (f32(1.0) - f32(0.5) * dark)
-        shades[c - first] *= sky + sun
+        beside = np.int32(here[max(c - 1, 0)]) + np.int32(here[min(c + 1, width - 1)])
+        covered = np.int32(here[c]) + np.int32(above[c]) + np.int32(below[c]) + beside
+        dark = f32(feet[c]) * f32(1.0 / 255.0)
+        light = from_sky * (f32(1.0) - dark) + sun * (f32(1.0) - f32(0.19) * f32(covered)) * (
+            f32(1.0) - f32(0.5) * dark
+        )
+        shades[c - first] *= light
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)

@@ -249,12 +249,26 @@ def draw_shadows(  # type: ignore[no-untyped-def]
         if not _in_view(projected[0, 0], projected[0, 1], projected[0, 2], reach, sides, camera[18]):
             continue
         base = first_vertex[mesh]
+        in_front = True
+        left, right, top, bottom = float(width), 0.0, float(height), 0.0
         for k in range(first_vertex[mesh + 1] - base):
             px, py, pz = vertices[base + k, 0], vertices[base + k, 1], vertices[base + k, 2]
             z = max(pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3], 0.0)
             x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3] - slope_x * z
             y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3] - slope_y * z
             _to_camera(x, y, 0.0, camera, projected, k)
+            if projected[k, 2] >= camera[18]:
+                u, v = projected[k, 3], projected[k, 4]
+                left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
+            else:
+                in_front = False
+                left, right, top, bottom = 0.0, float(width), 0.0, float(height)
+        left, right, top, bottom = max(left, 0.0), min(right, float(width)), max(top, 0.0), min(bottom, float(height))
+        if left >= right or top >= bottom:
+            continue
+        for row in range(int(top), ceil(bottom)):
+            spans[row, 0] = min(spans[row, 0], int(left))
+            spans[row, 1] = max(spans[row, 1], ceil(right))
         sun_x = pose[0, 0] * light[0] + pose[1, 0] * light[1] + pose[2, 0] * light[2]
         sun_y = pose[0, 1] * light[0] + pose[1, 1] * light[1] + pose[2, 1] * light[2]
         sun_z = pose[0, 2] * light[0] + pose[1, 2] * light[1] + pose[2, 2] * light[2]
@@ -262,31 +276,18 @@ def draw_shadows(  # type: ignore[no-untyped-def]
             # The faces towards the sun cover the same shadow as those away from it.
             if planes[f, 0] * sun_x + planes[f, 1] * sun_y + planes[f, 2] * sun_z <= 0.0:
                 continue
-            corners = _project_face(
-                faces[f, 0],
-                faces[f, 1],
-                faces[f, 2],
-                projected,
-                camera[18],
-                fx,
-                fy,
-                cx,
-                cy,
-                camera[16],
-                camera[17],
-                polygon,
-            )
-            for k in range(corners - 2):
-                _fill_mask(
-                    polygon[0, 0],
-                    polygon[0, 1],
-                    polygon[k + 1, 0],
-                    polygon[k + 1, 1],
-                    polygon[k + 2, 0],
-                    polygon[k + 2, 1],
-                    shadow,
-                    spans,
-                )
+            i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+            if in_front:
+                x0, y0 = projected[i, 3], projected[i, 4]
+                x1, y1 = projected[j, 3], projected[j, 4]
+                x2, y2 = projected[k, 3], projected[k, 4]
+                if ceil(min(y0, min(y1, y2))) < ceil(max(y0, max(y1, y2))):
+                    _fill_mask(x0, y0, x1, y1, x2, y2, shadow)
+                continue
+            corners = _project_face(i, j, k, projected, camera[18], fx, fy, cx, cy, camera[16], camera[17], polygon)
+            for n in range(corners - 2):
+                x1, y1, x2, y2 = polygon[n + 1, 0], polygon[n + 1, 1], polygon[n + 2, 0], polygon[n + 2, 1]
+                _fill_mask(polygon[0, 0], polygon[0, 1], x1, y1, x2, y2, shadow)
 
 
 @njit(cache=True, error_model="numpy")
@@ -500,15 +501,12 @@ def _fill(x0, y0, x1, y1, x2, y2, iz_u, iz_v, iz_0, number, inverse_depth, trian
 
 
 @njit(cache=True, error_model="numpy")
-def _fill_mask(x0, y0, x1, y1, x2, y2, mask, spans):  # type: ignore[no-untyped-def]
+def _fill_mask(x0, y0, x1, y1, x2, y2, mask):  # type: ignore[no-untyped-def]
     """Set the pixels of a triangle to 1."""
     height, width = mask.shape
     x0, y0, x1, y1, long_slope, upper, lower, first, last = _edges(x0, y0, x1, y1, x2, y2, width, height)
     for row in range(first, last):
         left, right = _columns(row, x0, y0, x1, y1, long_slope, upper, lower, width)
-        if left < right:
-            spans[row, 0] = min(spans[row, 0], left)
-            spans[row, 1] = max(spans[row, 1], right)
         for column in range(left, right):
             mask[row, column] = 1
 
