@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 POSITION_BOUND_M = 1000.0
@@ -121,12 +122,35 @@ def _leaf(agent: str, name: str, action: Mapping[str, Any], space: spaces.Space)
         raise ValueError(f"{agent}: leaf {name!r} must hold {'integers' if discrete else 'numbers'}, got {value.dtype}")
     if value.shape != space.shape:
         raise ValueError(f"{agent}: leaf {name!r} must have shape {space.shape}, got {value.shape}")
-    if value.size == 0:
-        return value.astype(np.int64 if discrete else np.float64)
-    low, high = (0, space.nvec[0] - 1) if discrete else (space.low, space.high)
-    if (value >= low).all() and (value <= high).all():
-        return value.astype(np.int64 if discrete else np.float64)
-    if not discrete and np.isnan(value).any():
-        raise ValueError(f"{agent}: leaf {name!r} holds NaN at {int(np.argmax(np.isnan(value)))}")
-    bad = int(np.argmin((value >= low) & (value <= high)))
+    out = np.array(value, dtype=np.int64 if discrete else np.float64)
+    if discrete:
+        nvec = space.nvec
+        if _counted(out, nvec):
+            return out
+        low, high = np.zeros_like(nvec), nvec - 1
+    else:
+        low, high = space.low, space.high
+        if _within(out, low, high):
+            return out
+    if not discrete and np.isnan(out).any():
+        raise ValueError(f"{agent}: leaf {name!r} holds NaN at {int(np.argmax(np.isnan(out)))}")
+    bad = int(np.argmin((out >= low) & (out <= high)))
     raise ValueError(f"{agent}: leaf {name!r} holds {value[bad]} at {bad}, outside the action space")
+
+
+@njit(cache=True)
+def _within(values, low, high):  # type: ignore[no-untyped-def]
+    """Whether all values (n,) are in [low, high]; NaN is not."""
+    for i in range(len(values)):  # noqa: SIM110 - Numba knows no all()
+        if not low[i] <= values[i] <= high[i]:
+            return False
+    return True
+
+
+@njit(cache=True)
+def _counted(values, counts):  # type: ignore[no-untyped-def]
+    """Whether all values (n,) are in 0..counts-1."""
+    for i in range(len(values)):  # noqa: SIM110
+        if not 0 <= values[i] < counts[i]:
+            return False
+    return True
