@@ -157,7 +157,7 @@ class PoseFilter:
         p = np.asarray(probabilities, dtype=np.float64) * (1 - o.overlooked)
         none = max(1.0 - float(p.sum()), o.overlooked)
         p, none = p**o.independence, none**o.independence
-        C_new = covariances / o.independence
+        C_new = covariances / o.independence + np.diag([1e-6, 1e-6, 1e-4, 1e-8])
         if k == 0 and h == 0:
             return Choice(0.0, -1, -1)
         log_volume = float(np.log(o.extent_m**2 * 2.0 * 2 * np.pi))

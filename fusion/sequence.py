@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,9 @@ from ..matching.graph import Matcher, Matching, ObjectGraph
 from ..matching.pose import Array, RelativePose, invert
 from .posefilter import Choice, PoseFilter, PoseFilterOptions, from_levelled, level_motion, to_levelled
 from .registration import RegistrationError, register
+
+MAX_SPREAD = 1e4
+"""Trace of a pose's covariance (m^2 and rad^2) beyond which a hypothesis is no information."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +28,7 @@ class PairOptions:
 
     filter: PoseFilterOptions = field(default_factory=PoseFilterOptions)
     trust: float = 0.5
+    refuse: float = 0.0
     min_registered: int = 4
 
 
@@ -54,17 +58,14 @@ class PairTracker:
         self.filter = PoseFilter(self.options.filter)
         self._ups: tuple[Array, Array] | None = None
         self._given: RelativePose | None = None
-        self._motion: tuple[Array | None, Array | None] = (np.eye(4), np.eye(4))
-        self._frames = 1
-        self._fresh = True
+        self._pending: list[tuple[Array | None, Array | None]] = []
 
-    def predict(
-        self, odometry_source: Array | None = None, odometry_target: Array | None = None, frames: int = 1
-    ) -> None:
-        """Carry the belief on by each robot's own motion (4, 4) since the last frame, sensor frames; None = unknown."""
-        self._motion = (odometry_source, odometry_target)
-        self._frames = frames
-        self._fresh = False
+    def predict(self, odometry_source: Array | None = None, odometry_target: Array | None = None) -> None:
+        """A frame has passed: each robot's own motion (4, 4) since the last, in sensor frames; None = unknown.
+
+        To be called for every frame, also for those in which the pair is not matched.
+        """
+        self._pending.append((odometry_source, odometry_target))
 
     def prior(self, odometry_source: Array | None = None, odometry_target: Array | None = None) -> RelativePose | None:
         """Prior for this frame, after `predict`; None while no pose is trusted."""
@@ -72,6 +73,7 @@ class PairTracker:
         self._given = None
         if self._ups is not None:
             self._carry(*self._ups)
+            self._pending.clear()
             best = self.filter.best()
             if best is not None and best[2] >= self.options.trust:
                 self._given = from_levelled(best[0], best[1], *self._ups)
@@ -109,14 +111,15 @@ class PairTracker:
         alone = matcher(source, target, prior=None, rng=rng, **options)
         if source.up is None or target.up is None:
             return alone
-        if self._ups is not None and not self._fresh:
+        if self._ups is not None:
             self._carry(source.up, target.up)
+        self._pending.clear()
         self._ups = (source.up, target.up)
         before = [(m, C) for m, C in zip(self.filter.means, self.filter.covariances, strict=True)]
         found = propose(source, target, alone, self.options.min_registered)
         choice = self._absorb(found)
         if choice.probability < self.options.trust:
-            return alone
+            return _believed(alone, choice.probability, self.options.refuse)
         if choice.component >= 0:
             mean, covariance = before[choice.component]
             prior = from_levelled(mean, covariance, *self._ups)
@@ -127,16 +130,16 @@ class PairTracker:
         return matcher(source, target, prior=prior, rng=rng, **options)
 
     def _carry(self, up_source: Array, up_target: Array) -> None:
-        """Apply the motion announced by `predict`, once."""
+        """Apply the motions announced by `predict`; the tilt of frames in between is taken to be the last known one."""
         assert self._ups is not None
-        source, target = self._motion
-        motions = (
-            None if source is None else level_motion(source, self._ups[0], up_source),
-            None if target is None else level_motion(target, self._ups[1], up_target),
-        )
-        for _ in range(self._frames):
-            self.filter.predict(*motions)
-        self._motion = (np.eye(4), np.eye(4))
+        before_s, before_t = self._ups
+        for step, (source, target) in enumerate(self._pending, start=1):
+            last = step == len(self._pending)
+            after_s, after_t = (up_source, up_target) if last else (before_s, before_t)
+            self.filter.predict(
+                None if source is None else level_motion(source, before_s, after_s),
+                None if target is None else level_motion(target, before_t, after_t),
+            )
 
     def _absorb(self, found: list[tuple[RelativePose, float]]) -> Choice:
         assert self._ups is not None
@@ -146,12 +149,20 @@ class PairTracker:
         return self.filter.update(means, covariances, np.array([p for _, p in found]))
 
 
+def _believed(matching: Matching, probability: float, refuse: float) -> Matching:
+    """The matches that remain when the pose behind them is only so probable."""
+    scores = matching.scores * probability
+    keep = scores >= refuse
+    return replace(matching, pairs=matching.pairs[keep], scores=scores[keep]) if refuse > 0 else matching
+
+
 def propose(
     source: ObjectGraph, target: ObjectGraph, matching: Matching, min_registered: int = 4
 ) -> list[tuple[RelativePose, float]]:
     """Poses a matching stands for, with probabilities, the first most probable: hypotheses, pose, or one registered."""
     if matching.hypotheses:
-        return [(h.pose, h.probability) for h in matching.hypotheses]
+        # A pose that the matches leave open says nothing.
+        return [(h.pose, h.probability) for h in matching.hypotheses if np.trace(h.pose.covariance) < MAX_SPREAD]
     if len(matching) == 0:
         return []
     probability = float(matching.scores.mean())
