@@ -2,34 +2,28 @@
 
 Every relative pose that two correspondences suggest is verified against all detections with their full covariances,
 refined, and weighed by its evidence; the matches' probabilities are averaged over the poses, "nothing in common" among
-them.
-The model is written out in docs/explanation/bayes.md.
+them. The model is written out in docs/explanation/bayes.md.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .bayes_hypotheses import candidate_pairs, candidate_triangles, distinct_best, distinct_best_spatial, screen
-from .bayes_prepare import (
-    LOG_2PI,
-    class_evidence,
-    height_correction,
-    height_spread,
-    level,
-    levelling_rotation,
-    shrink_heights,
-    spread_area,
-    spread_volume,
-)
-from .bayes_refine import refine, screen_spatial
-from .graph import DEFAULT_BEARING_STD_RAD, Matching, ObjectGraph, check_comparable
+from .bayes_prepare import LOG_2PI, Problem, Settings, levelling_rotation, prepare, ranges
+from .bayes_solve import Modes, Prior, decode, mix, solve_levelled, solve_spatial
+from .bayes_view import View
+from .graph import DEFAULT_BEARING_STD_RAD, Hypothesis, Matching, ObjectGraph, check_comparable
 from .pose import Array, RelativePose
 
-TEMPERS = np.array([4.0, 2.0, 1.0])
+HALF_RANGE_QUANTILE = 0.75
+OCCLUDER = 0.022
+OCCLUDED = 0.75
+POSE_CONCENTRATION = 1.7
+"""Nats by which poses of views that share objects are more concentrated than the uniform prior says (fitted)."""
+
+LEAST_HYPOTHESIS = 0.01
 
 
 def bayes(
@@ -40,134 +34,158 @@ def bayes(
     rng: np.random.Generator | None = None,
     min_score: float = 0.4,
     common_probability: float = 0.5,
-    class_sharpness: float = 2.0,
+    bearing_std_rad: float = DEFAULT_BEARING_STD_RAD,
+    class_sharpness: float = 2.5,
     mislabel: float = 0.01,
-    log_odds: float = 1.5,
-    screened: int = 800,
-    refined: int = 16,
+    extent: float = 0.018,
+    depth_offset: float = 0.035,
+    depth_offset_std: float = 0.03,
+    scale_std: float = 0.0,
+    detection: float = 0.9,
+    screened: int = 300,
+    refined: int = 8,
     max_hypotheses: int = 5,
 ) -> Matching:
-    """Match by evidence over relative poses."""
+    """Match by evidence over relative poses.
+
+    Gravity is used where both graphs carry `up`; field of view, the robots themselves and occlusion where both know
+    their view (`intrinsics` and `image_size`, or `horizontal_fov_rad` with `forward` and `up`). Lengths without a unit
+    are fractions of the median range of all detections, so that the answer does not depend on the unit of length.
+
+    Args:
+        source, target: the two robots' graphs.
+        prior: noisy relative pose, if known; its Gaussian enters the evidence.
+        rng: not used, the method is deterministic.
+        min_score: matches of a lower probability are not made. A threshold of half the F1 to be expected maximises
+            the F1 pooled over many pairs, whence the default.
+        common_probability: prior probability that two views show any common object; not used with a prior pose.
+        bearing_std_rad: error across the viewing ray of graphs without full covariances, radians.
+        class_sharpness: power that turns class confidences into likelihoods.
+        mislabel: share of class labels that tell nothing.
+        extent: standard deviation of the visible part's centre about the object's, for graphs with intrinsics.
+        depth_offset, depth_offset_std: prior of the distance from the visible face to the object's centre along the
+            ray, which is estimated for every class, for graphs with intrinsics.
+        scale_std: prior standard deviation of each robot's relative depth scale, which is then estimated; 0 = no bias.
+        detection: probability of detecting a near object in plain view.
+        screened: hypotheses verified against all detections.
+        refined: hypotheses refined to modes of the posterior.
+        max_hypotheses: most explanations to return.
+
+    Returns:
+        Matches with their posterior probabilities; `pose` (None when refused) and `hypotheses` of the modes;
+        `diagnostics["nothing_in_common"]`, the probability of that.
+
+    Raises:
+        ValueError: graphs of different classes, or an option out of its range.
+    """
+    _check_options(min_score, common_probability, screened, refined)
     check_comparable(source, target)
     n, m = len(source), len(target)
     if n == 0 or m == 0:
         return Matching.empty()
-    problem = _prepare(source, target, prior, class_sharpness, mislabel, log_odds)
-    starts = _starts(problem, screened, refined)
-    modes = [_refine(problem, R, t) for R, t in starts]
-    modes = [mode for mode in modes if mode.log_evidence > -1e299]
-    modes = _distinct(modes)
-    return _decide(problem, modes, common_probability, min_score, max_hypotheses)
-
-
-@dataclass(frozen=True, eq=False)
-class _Problem:
-    """Everything known before a pose. `turns`: 1 where gravity levels both views, else 3."""
-
-    turns: int
-    L_a: Array
-    L_b: Array
-    p_a: Array
-    S_a: Array
-    p_b: Array
-    S_b: Array
-    static: Array
-    height: float
-    height_variance: float
-    prior_R: Array
-    prior_t: Array
-    prior_precision: Array
-    prior_log_norm: float
-    has_prior: bool
-
-
-@dataclass(frozen=True, eq=False)
-class _Mode:
-    R: Array
-    t: Array
-    log_evidence: float
-    marginals: Array
-    information: Array
-
-
-def _prepare(
-    source: ObjectGraph,
-    target: ObjectGraph,
-    prior: RelativePose | None,
-    sharpness: float,
-    mislabel: float,
-    log_odds: float,
-) -> _Problem:
-    n, m = len(source), len(target)
-    turns = 1 if source.up is not None and target.up is not None else 3
-    L_a, p_a, S_a = _levelled(source, turns == 1)
-    L_b, p_b, S_b = _levelled(target, turns == 1)
-    static = np.zeros((n, m))
-    top_a, top_b = np.zeros(n, np.int64), np.zeros(m, np.int64)
-    class_evidence(
-        source.attributes,
-        source.attribute_variance,
-        target.attributes,
-        target.attribute_variance,
-        sharpness,
-        mislabel,
-        static,
-        top_a,
-        top_b,
+    q = Settings(
+        class_sharpness, mislabel, 4.0, 3.0, 0.8, 1.2, 1.5, extent, depth_offset, depth_offset_std, scale_std, 0.04
     )
-    precision = np.zeros((turns + 3, turns + 3))
-    R0, t0 = np.eye(3), np.zeros(3)
-    height = height_variance = 0.0
-    if turns == 1:
-        variance, mean_a, mean_b = height_spread(p_a, S_a, p_b, S_b)
-        shrink_heights(p_a, S_a, mean_a, variance)
-        shrink_heights(p_b, S_b, mean_b, variance)
-        height_correction(p_a, S_a, mean_a, p_b, S_b, mean_b, variance, static)
-        room_a, room_b = spread_area(p_a), spread_area(p_b)
-        height = mean_a - mean_b
-        height_variance = variance * (1 / n + 1 / m) * 2 + 1e-6
-        precision[3, 3] = 1 / height_variance
-        t0[2] = height
-        log_norm = -np.log(2 * np.pi * (np.sqrt(room_a) + np.sqrt(room_b)) ** 2) - 0.5 * (
-            LOG_2PI + np.log(height_variance)
+    gravity = source.up is not None and target.up is not None
+    L_a, L_b = _levelling(source, gravity), _levelling(target, gravity)
+    view_a, view_b = _views(source, target, L_a, L_b, detection)
+    problem = prepare(
+        *_arrays(source),
+        L_a,
+        *_arrays(target),
+        L_b,
+        bearing_std_rad**2,
+        gravity,
+        source.intrinsics is not None and target.intrinsics is not None,
+        view_a.known > 0 and view_b.known > 0,
+        q,
+    )
+    pose_prior = _pose_prior(prior, problem, L_a, L_b, gravity)
+    solve = solve_levelled if gravity else solve_spatial
+    modes = solve(problem, pose_prior, view_a, view_b, q, screened, refined)
+    if prior is None:
+        weights, P = mix(
+            modes, math.log(common_probability) + POSE_CONCENTRATION, math.log1p(-common_probability), n, m
         )
     else:
-        room_a, room_b = spread_volume(p_a, S_a), spread_volume(p_b, S_b)
-        log_norm = -np.log(8 * np.pi**2 * (np.cbrt(room_a) + np.cbrt(room_b)) ** 3)
-    static += log_odds + 0.5 * (np.log(room_a / n) + np.log(room_b / m))
-    if prior is not None:
-        R0, t0, precision, log_norm = _combine(prior, L_a, L_b, turns, t0, precision)
-    return _Problem(
-        turns,
-        L_a,
-        L_b,
-        p_a,
-        S_a,
-        p_b,
-        S_b,
-        static,
-        height,
-        height_variance,
-        R0,
-        t0,
-        precision,
-        log_norm,
-        prior is not None,
+        weights, P = mix(modes, 0.0, -1e9, n, m)
+    pairs, scores = decode(P, min_score)
+    hypotheses = _hypotheses(modes, weights, L_a, L_b, gravity, max_hypotheses)
+    likeliest = hypotheses[0] if hypotheses else None
+    refused = likeliest is None or likeliest.probability < weights[0]
+    return Matching(
+        pairs,
+        scores,
+        pose=None if refused or likeliest is None else likeliest.pose,
+        hypotheses=hypotheses,
+        diagnostics={"nothing_in_common": float(weights[0]), "modes": len(modes.log_evidence), "probabilities": P},
     )
 
 
-def _levelled(graph: ObjectGraph, gravity: bool) -> tuple[Array, Array, Array]:
-    L = levelling_rotation(graph.up) if gravity and graph.up is not None else np.eye(3)
-    p, S = np.empty((len(graph), 3)), np.empty((len(graph), 3, 3))
+def _check_options(min_score: float, common_probability: float, screened: int, refined: int) -> None:
+    if not 0.0 <= min_score <= 1.0:
+        raise ValueError(f"min_score must lie in [0, 1], got {min_score}")
+    if not 0.0 < common_probability < 1.0:
+        raise ValueError(f"common_probability must lie in (0, 1), got {common_probability}")
+    if screened < 1 or refined < 1:
+        raise ValueError(f"screened and refined must be at least 1, got {screened} and {refined}")
+
+
+def _levelling(graph: ObjectGraph, gravity: bool) -> Array:
+    return levelling_rotation(graph.up) if gravity else np.eye(3)
+
+
+def _arrays(graph: ObjectGraph) -> tuple[Array, Array, Array, Array, Array]:
     covariances = np.empty((0, 3, 3)) if graph.covariances is None else graph.covariances
-    level(graph.positions, graph.position_variance, covariances, DEFAULT_BEARING_STD_RAD**2, L, p, S)
-    return L, p, S
+    arrays = graph.positions, graph.position_variance, covariances, graph.attributes, graph.attribute_variance
+    return tuple(np.ascontiguousarray(x) for x in arrays)  # type: ignore[return-value]
 
 
-def _combine(
-    prior: RelativePose, L_a: Array, L_b: Array, turns: int, t0: Array, precision: Array
-) -> tuple[Array, Array, Array, float]:
-    """Prior pose between levelled frames, with what heights say: rotation, translation, precision, log normaliser."""
+def _views(source: ObjectGraph, target: ObjectGraph, L_a: Array, L_b: Array, detection: float) -> tuple[View, View]:
+    distance = ranges(np.ascontiguousarray(source.positions), np.ascontiguousarray(target.positions))
+    median = max(float(distance[len(distance) // 2]), 1e-3)
+    half_range = max(float(distance[int(HALF_RANGE_QUANTILE * (len(distance) - 1))]), 1e-3)
+    planes = [_view_planes(source), _view_planes(target)]
+    known = float(planes[0] is not None and planes[1] is not None)
+    views = []
+    for normals, L in zip(planes, (L_a, L_b), strict=True):
+        turned = np.zeros((0, 3)) if normals is None else np.ascontiguousarray(normals @ L.T)
+        views.append(View(known, turned, half_range, detection, OCCLUDER * median, OCCLUDED))
+    return views[0], views[1]
+
+
+def _view_planes(graph: ObjectGraph) -> Array | None:
+    """Inward normals (2, 3), sensor frame, of the planes left and right of a graph's field of view; None = unknown."""
+    if graph.intrinsics is not None and graph.image_size is not None:
+        focal, centre, width = graph.intrinsics[0, 0], graph.intrinsics[0, 2], graph.image_size[0]
+        # Left: x / z > -centre / focal; right: x / z < (width - centre) / focal.
+        planes = np.array([[focal, 0.0, centre], [-focal, 0.0, width - centre]])
+        return planes / np.sqrt((planes**2).sum(axis=1, keepdims=True))
+    fov = graph.horizontal_fov_rad
+    if fov is None or graph.forward is None or graph.up is None or fov >= np.pi:
+        return None
+    side = np.cross(graph.up, graph.forward)
+    return np.stack([np.sin(fov / 2) * graph.forward + s * np.cos(fov / 2) * side for s in (1.0, -1.0)])
+
+
+def _pose_prior(prior: RelativePose | None, x: Problem, L_a: Array, L_b: Array, gravity: bool) -> Prior:
+    """Prior between levelled frames: what heights say, and the prior pose."""
+    turns = 1 if gravity else 3
+    precision = np.zeros((turns + 3, turns + 3))
+    t = np.array([0.0, 0.0, x.height])
+    if gravity:
+        precision[3, 3] = 1.0 / x.height_variance
+        area = (math.sqrt(x.room_a) + math.sqrt(x.room_b)) ** 2
+        log_norm = -math.log(2 * math.pi * area) - 0.5 * (LOG_2PI + math.log(x.height_variance))
+    else:
+        volume = (math.cbrt(x.room_a) + math.cbrt(x.room_b)) ** 3
+        log_norm = -math.log(8 * math.pi**2 * volume)
+    if prior is None:
+        return Prior(0.0, np.eye(3), t, precision, log_norm)
+    return _combined(prior, L_a, L_b, turns, t, precision)
+
+
+def _combined(prior: RelativePose, L_a: Array, L_b: Array, turns: int, height: Array, precision: Array) -> Prior:
     R = L_a @ prior.T_source_target[:3, :3] @ L_b.T
     # The prior perturbs on the right, in target axes; here rotation comes first and both are in source axes.
     G = np.zeros((6, 6))
@@ -175,135 +193,53 @@ def _combine(
     covariance = G @ prior.covariance @ G.T + 1e-9 * np.eye(6)
     t = L_a @ prior.T_source_target[:3, 3]
     if turns == 1:
-        R = _turn(np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1]))
+        R = _turn(math.atan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1]))
         covariance = covariance[2:, 2:]
-    P = np.linalg.inv(covariance)
-    total = P + precision
-    shift = np.linalg.solve(total, precision[:, turns:] @ (t0 - t))
+    total = np.linalg.inv(covariance) + precision
+    shift = np.linalg.solve(total, precision[:, turns:] @ (height - t))
     if turns == 1:
         R = _turn(float(shift[0])) @ R
-    log_norm = 0.5 * np.linalg.slogdet(total)[1] - 0.5 * len(total) * LOG_2PI
-    return R, t + shift[turns:], total, float(log_norm)
+    log_norm = 0.5 * float(np.linalg.slogdet(total)[1]) - 0.5 * len(total) * LOG_2PI
+    return Prior(1.0, np.ascontiguousarray(R), t + shift[turns:], total, log_norm)
 
 
 def _turn(yaw: float) -> Array:
-    c, s = np.cos(yaw), np.sin(yaw)
+    c, s = math.cos(yaw), math.sin(yaw)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _starts(q: _Problem, screened: int, refined: int) -> list[tuple[Array, Array]]:
-    """Poses to refine: the prior's, then the best of those that two (without gravity three) correspondences suggest."""
-    first = [(q.prior_R.copy(), q.prior_t.copy())] if q.has_prior else []
-    if min(q.static.shape) < (2 if q.turns == 1 else 3):
-        return first
-    return first + (_starts_levelled(q, screened, refined) if q.turns == 1 else _starts_spatial(q, screened, refined))
-
-
-def _starts_levelled(q: _Problem, screened: int, refined: int) -> list[tuple[Array, Array]]:
-    pairs, rank = candidate_pairs(q.p_a, q.S_a, q.p_b, q.S_b, q.static, q.static.max() - 6.0, 6.0, 50000)
-    if len(pairs) == 0:
-        return []
-    if q.has_prior:
-        covariance = np.linalg.inv(q.prior_precision)[:3, :3]
-        mean = np.array([np.arctan2(q.prior_R[1, 0], q.prior_R[0, 0]), q.prior_t[0], q.prior_t[1]])
-    else:
-        mean, covariance = np.zeros(3), np.zeros((0, 0))
-        if len(pairs) > screened:
-            pairs = pairs[np.argpartition(-rank, screened)[:screened]]
-    poses, scores = np.empty((len(pairs), 3)), np.empty(len(pairs))
-    screen(q.p_a, q.S_a, q.p_b, q.S_b, q.static, q.height, q.height_variance, mean, covariance, pairs, poses, scores)
-    scale = np.sqrt(np.median(q.S_a[:, 0, 0] + q.S_a[:, 1, 1]))
-    best = distinct_best(poses, scores, 0.05, scale, 0.0, refined)
-    return [(_turn(poses[k, 0]), np.array([poses[k, 1], poses[k, 2], q.height])) for k in best]
-
-
-def _starts_spatial(q: _Problem, screened: int, refined: int) -> list[tuple[Array, Array]]:
-    R, t, rank, _ = candidate_triangles(
-        q.p_a, q.S_a, q.p_b, q.S_b, q.static, q.static.max() - 6.0, 6.0, screened, 20000
-    )
-    if len(R) == 0:
-        return []
-    if len(R) > screened:
-        best = np.argpartition(-rank, screened)[:screened]
-        R, t = R[best], t[best]
-    scores = np.empty(len(R))
-    screen_spatial(q.p_a, q.S_a, q.p_b, q.S_b, q.static, R, t, 3.0, scores)
-    scale = np.sqrt(np.median(np.trace(q.S_a, axis1=1, axis2=2)))
-    best = distinct_best_spatial(R, t, scores, 0.1, 2 * scale, refined)
-    return [(R[k].copy(), t[k].copy()) for k in best]
-
-
-def _refine(q: _Problem, R: Array, t: Array) -> _Mode:
-    n, m = q.static.shape
-    d = q.turns + 3
-    marginals, information = np.zeros((n, m)), np.zeros((d, d))
-    none_a, none_b = np.zeros((n, 0, 3)), np.zeros((m, 0, 3))
-    evidence = refine(
-        q.p_a,
-        q.S_a,
-        none_a,
-        q.p_b,
-        q.S_b,
-        none_b,
-        q.static,
-        q.prior_R,
-        q.prior_t,
-        q.prior_precision,
-        q.prior_log_norm,
-        R,
-        t,
-        np.zeros(0),
-        q.turns,
-        TEMPERS,
-        12,
-        marginals,
-        information,
-    )
-    return _Mode(R, t, evidence, marginals, information)
-
-
-def _distinct(modes: list[_Mode]) -> list[_Mode]:
-    keep: list[_Mode] = []
-    for mode in sorted(modes, key=lambda x: -x.log_evidence):
-        for other in keep:
-            D = mode.R @ other.R.T
-            w = 0.5 * np.array([D[2, 1] - D[1, 2], D[0, 2] - D[2, 0], D[1, 0] - D[0, 1]])
-            if np.trace(D) < 1.0:
-                continue
-            d = np.concatenate([w[3 - (len(mode.information) - 3) :], mode.t - other.t])
-            if d @ other.information @ d < 1.0:
-                break
-        else:
-            keep.append(mode)
-    return keep
-
-
-def _decide(q: _Problem, modes: list[_Mode], common: float, min_score: float, count: int) -> Matching:
-    if not modes:
-        return Matching.empty()
-    logs = np.array([0.0] + [x.log_evidence for x in modes])
-    if not q.has_prior:
-        logs[0] += np.log1p(-common)
-        logs[1:] += np.log(common)
-    else:
-        logs[0] = -np.inf
-    weights = np.exp(logs - logs.max())
-    weights /= weights.sum()
-    P = sum(w * x.marginals for w, x in zip(weights[1:], modes, strict=True))
-    pairs, scores = _decode(P, min_score)
-    return Matching(pairs, scores, diagnostics={"modes": modes, "weights": weights, "P": P})
-
-
-def _decode(P: Array, threshold: float) -> tuple[NDArray[np.int64], Array]:
-    pairs, scores = [], []
-    P = np.minimum(P, 1.0)
-    work = P.copy()
-    while work.size:
-        i, j = np.unravel_index(np.argmax(work), work.shape)
-        if work[i, j] < threshold:
+def _hypotheses(
+    modes: Modes, weights: Array, L_a: Array, L_b: Array, gravity: bool, most: int
+) -> tuple[Hypothesis, ...]:
+    out: list[Hypothesis] = []
+    for k in np.argsort(-weights[1:], kind="stable")[:most]:
+        probability = float(weights[1 + k])
+        if out and probability < LEAST_HYPOTHESIS:
             break
-        pairs.append((i, j))
-        scores.append(work[i, j])
-        work[i] = 0
-        work[:, j] = 0
-    return np.array(pairs, dtype=np.int64).reshape(-1, 2), np.array(scores)
+        pairs, scores = decode(np.minimum(modes.marginals[k], 1.0), 0.5)
+        pose = _relative_pose(modes.R[k], modes.t[k], modes.information[k], L_a, L_b, gravity)
+        out.append(Hypothesis(pose, probability, pairs, scores))
+    return tuple(out)
+
+
+def _relative_pose(R: Array, t: Array, information: Array, L_a: Array, L_b: Array, gravity: bool) -> RelativePose:
+    """Pose between sensor frames, with the covariance that biases leave it; roll and pitch are exact under gravity."""
+    covariance = np.zeros((6, 6))
+    first = 2 if gravity else 0
+    d = 6 - first
+    scale = np.sqrt(np.maximum(np.diag(information), 1e-12))
+    whitened = information / np.outer(scale, scale) + 1e-9 * np.eye(len(scale))
+    inverse = np.linalg.inv(whitened) / np.outer(scale, scale)
+    covariance[first:, first:] = inverse[:d, :d]
+    # To [translation, rotation] in target axes.
+    G = np.zeros((6, 6))
+    G[:3, 3:] = G[3:, :3] = L_b.T @ R.T
+    T = np.eye(4)
+    T[:3, :3] = L_a.T @ R @ L_b
+    T[:3, 3] = L_a.T @ t
+    covariance = G @ covariance @ G.T
+    # Rigid and symmetric by construction: `RelativePose`'s checks would cost more than the match.
+    pose = object.__new__(RelativePose)
+    object.__setattr__(pose, "T_source_target", T)
+    object.__setattr__(pose, "covariance", 0.5 * (covariance + covariance.T))
+    return pose

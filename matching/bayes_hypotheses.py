@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from .bayes_view import View, detection_probability
 from .pose import Array
 
 Indices = NDArray[np.int64]
@@ -35,47 +36,92 @@ def pair_distances(p: Array, S: Array) -> tuple[Array, Array]:
 
 
 @njit(cache=True)
-def candidate_pairs(
-    p_a: Array, S_a: Array, p_b: Array, S_b: Array, static: Array, min_static: float, max_chi2: float, capacity: int
-) -> tuple[Indices, Array]:
-    """Two correspondences (i1, j1), (i2, j2) of compatible distance and class: indices (k, 4) and rank (k,).
+def precise_pairs(distance: Array, variance: Array, limit: int) -> Indices:
+    """Up to `limit` pairs (k, 2) of objects, i < j, whose distance is known best for its length."""
+    n = len(distance)
+    pairs = np.empty((n * (n - 1) // 2, 2), dtype=np.int64)
+    cost = np.empty(len(pairs))
+    k = 0
+    for i in range(n):
+        for j in range(i + 1, n):
+            pairs[k, 0], pairs[k, 1] = i, j
+            cost[k] = variance[i, j] / (distance[i, j] ** 2 + 1e-12)
+            k += 1
+    if k <= limit:
+        return pairs
+    return pairs[np.argsort(cost)[:limit]]
 
-    The rank prefers pairs of likely classes, and poses that the two correspondences pin down well.
+
+@njit(cache=True)
+def candidate_pairs(
+    p_a: Array,
+    S_a: Array,
+    p_b: Array,
+    S_b: Array,
+    likely: Array,
+    least: float,
+    max_chi2: float,
+    limit: int,
+    wanted: int,
+) -> Indices:
+    """Two correspondences (i1, i2, j1, j2) of compatible distance, height and class: the best `wanted`, (k, 4).
+
+    Ranked by class evidence `likely` (n, m) and by the density of their distance's error. Of large views only the
+    `limit` most precise pairs of source objects are tried.
     """
     d_a, v_a = pair_distances(p_a, S_a)
     d_b, v_b = pair_distances(p_b, S_b)
-    n, m = len(p_a), len(p_b)
+    m = len(p_b)
+    capacity = 16 * wanted
     out = np.empty((capacity, 4), dtype=np.int64)
     rank = np.empty(capacity)
     k = 0
-    for i1 in range(n):
-        for i2 in range(i1 + 1, n):
-            d1, v1 = d_a[i1, i2], v_a[i1, i2]
-            h = p_a[i2, 2] - p_a[i1, 2]
-            hv = S_a[i1, 2, 2] + S_a[i2, 2, 2]
-            for j1 in range(m):
-                if static[i1, j1] < min_static:
+    worst = -1e300
+    for i1, i2 in precise_pairs(d_a, v_a, limit):
+        d1, v1 = d_a[i1, i2], v_a[i1, i2]
+        if d1 < 1e-6:
+            continue
+        h = p_a[i2, 2] - p_a[i1, 2]
+        hv = S_a[i1, 2, 2] + S_a[i2, 2, 2]
+        for j1 in range(m):
+            if likely[i1, j1] < least:
+                continue
+            for j2 in range(m):
+                e = d1 - d_b[j1, j2]
+                v = v1 + v_b[j1, j2]
+                if e * e > max_chi2 * v or j1 == j2 or d_b[j1, j2] < 1e-6:
                     continue
-                for j2 in range(m):
-                    if j1 == j2:
-                        continue
-                    e = d1 - d_b[j1, j2]
-                    v = v1 + v_b[j1, j2]
-                    if e * e > max_chi2 * v:
-                        continue
-                    likely = static[i1, j1] + static[i2, j2]
-                    if static[i2, j2] < min_static or likely < min_static:
-                        continue
-                    z = h - (p_b[j2, 2] - p_b[j1, 2])
-                    vz = hv + S_b[j1, 2, 2] + S_b[j2, 2, 2]
-                    if z * z > max_chi2 * vz or d1 < 1e-6 or d_b[j1, j2] < 1e-6:
-                        continue
-                    if k == capacity:
-                        return out, rank
-                    out[k, 0], out[k, 1], out[k, 2], out[k, 3] = i1, i2, j1, j2
-                    rank[k] = likely - 0.5 * e * e / v - 0.5 * np.log(v)
-                    k += 1
-    return out[:k], rank[:k]
+                evidence = likely[i1, j1] + likely[i2, j2]
+                if likely[i2, j2] < least or evidence < least:
+                    continue
+                z = h - (p_b[j2, 2] - p_b[j1, 2])
+                if z * z > max_chi2 * (hv + S_b[j1, 2, 2] + S_b[j2, 2, 2]):
+                    continue
+                score = evidence - 0.5 * e * e / v - 0.5 * np.log(v)
+                if score < worst:
+                    continue
+                if k == capacity:
+                    k = keep_best(out, rank, wanted)
+                    worst = rank[:k].min()
+                out[k, 0], out[k, 1], out[k, 2], out[k, 3] = i1, i2, j1, j2
+                rank[k] = score
+                k += 1
+    if k > wanted:
+        k = keep_best(out[:k], rank[:k], wanted)
+    return out[:k]
+
+
+@njit(cache=True)
+def keep_best(items: Indices, rank: Array, wanted: int) -> int:
+    """Move the `wanted` items of highest rank to the front; returns how many stayed."""
+    threshold = np.partition(rank, len(rank) - wanted)[len(rank) - wanted]
+    k = 0
+    for c in range(len(rank)):
+        if rank[c] >= threshold and k < wanted:
+            items[k] = items[c]
+            rank[k] = rank[c]
+            k += 1
+    return k
 
 
 @njit(cache=True)
@@ -140,6 +186,9 @@ def screen(
     height_variance: float,
     prior_mean: Array,
     prior_covariance: Array,
+    log_odds: float,
+    view_a: View,
+    view_b: View,
     pairs: Indices,
     poses: Array,
     scores: Array,
@@ -149,6 +198,7 @@ def screen(
     Each residual has the covariance of both detections and of the hypothesised pose. A prior of the pose (yaw, x, y),
     mean (3,) and covariance (3, 3), takes its log density off; shape (0, 0) means none.
     """
+    seen = view_a.known > 0 and view_b.known > 0
     known = len(prior_covariance) > 0
     C = np.empty((3, 3))
     d = np.empty(3)
@@ -164,7 +214,7 @@ def screen(
         yaw, tx, ty = hyp[0], hyp[1], hyp[2]
         c, s = np.cos(yaw), np.sin(yaw)
         best_a[:] = 0.0
-        total_b = 0.0
+        total_b = void = 0.0
         for j in range(m):
             ux, uy = c * p_b[j, 0] - s * p_b[j, 1], s * p_b[j, 0] + c * p_b[j, 1]
             kx, ky = -uy, ux
@@ -187,17 +237,24 @@ def screen(
                     continue
                 vz = S_a[i, 2, 2] + S_b[j, 2, 2] + height_variance
                 z = p_a[i, 2] - p_b[j, 2] - height
-                w = static[i, j] - 0.5 * (chi2 + z * z / vz + np.log(det * vz)) - 1.5 * LOG_2PI
+                w = log_odds + static[i, j] - 0.5 * (chi2 + z * z / vz + np.log(det * vz)) - 1.5 * LOG_2PI
                 if w > best:
                     best = w
                 if w > best_a[i]:
                     best_a[i] = w
             total_b += best
+            if seen and best == 0.0:
+                void += np.log(1.0 - detection_probability(ux, uy, p_b[j, 2] + height, view_a, p_a))
         total_a = 0.0
         for i in range(n):
             total_a += best_a[i]
+            if seen and best_a[i] == 0.0:
+                x, y = p_a[i, 0] - tx, p_a[i, 1] - ty
+                void += np.log(
+                    1.0 - detection_probability(c * x + s * y, c * y - s * x, p_a[i, 2] - height, view_b, p_b)
+                )
         poses[k, 0], poses[k, 1], poses[k, 2] = yaw, tx, ty
-        scores[k] = min(total_a, total_b)
+        scores[k] = min(total_a, total_b) + 0.7 * void
         if known:
             C[:] = prior_covariance
             C[0, 0] += hyp[3]
@@ -213,7 +270,7 @@ def screen(
 
 
 @njit(cache=True)
-def distinct_best(poses: Array, scores: Array, yaw_gap: float, shift_gap: float, reach: float, count: int) -> Indices:
+def distinct_best(poses: Array, scores: Array, yaw_gap: float, shift_gap: float, count: int) -> Indices:
     """Indices of the `count` best poses, none near a better one: yaw (rad) and the shift (m) at the views' centre."""
     order = np.argsort(-scores)
     keep = np.empty(count, dtype=np.int64)

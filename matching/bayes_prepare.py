@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from .pose import Array
 
+Indices = NDArray[np.int64]
+
 LOG_2PI = float(np.log(2 * np.pi))
-UNKNOWN_VARIANCE_FACTOR = 100.0
 
 
 @njit(cache=True)
@@ -264,3 +268,212 @@ def spread_volume(p: Array, S: Array) -> float:
     for a in range(3):
         C[a, a] += 0.003 * size + 1e-6
     return 4.0 / 3.0 * np.pi * 5.0**1.5 * np.sqrt(max(np.linalg.det(C), 1e-18))
+
+
+class Settings(NamedTuple):
+    """The model's constants; lengths are in units of the median range of all detections (see `bayes`)."""
+
+    class_sharpness: float
+    mislabel: float
+    overlap_alpha: float
+    overlap_beta: float
+    match_bonus: float
+    view_bonus: float
+    initial_log_odds: float
+    extent: float
+    depth_offset: float
+    depth_offset_std: float
+    scale_std: float
+    robot_extent: float
+
+
+class Problem(NamedTuple):
+    """Everything known before a pose. The last object of either side is the robot itself, at its origin.
+
+    Attributes:
+        p_a, p_b: (n + 1, 3), (m + 1, 3) m, levelled and shrunk to the common height.
+        S_a, S_b: covariances (., 3, 3) m^2.
+        B_a, B_b: (., nb, 3) how each bias moves each object.
+        bias_precision: (nb,) of the biases' Gaussian priors, whose means are 0.
+        static: (n + 1, m + 1) log weight of a match less its residual's density: class, clutter density, height.
+        likely: (n + 1, m + 1) class evidence alone.
+        height: m, expected height of the target's frame above the source's; height_variance: m^2.
+        room_a, room_b: area (m^2), or without gravity volume (m^3), over which detections spread.
+        median_range: m.
+    """
+
+    p_a: Array
+    S_a: Array
+    B_a: Array
+    p_b: Array
+    S_b: Array
+    B_b: Array
+    bias_precision: Array
+    static: Array
+    likely: Array
+    height: float
+    height_variance: float
+    room_a: float
+    room_b: float
+    median_range: float
+
+
+@njit(cache=True)
+def ranges(positions: Array, others: Array) -> Array:
+    """All distances (n + m,) m from either robot, ascending."""
+    n = len(positions)
+    out = np.empty(n + len(others))
+    for k in range(len(out)):
+        p = positions[k] if k < n else others[k - n]
+        out[k] = np.sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2])
+    return np.sort(out)
+
+
+@njit(cache=True)
+def log_room_per_object(p: Array, room: float, dims: int) -> Array:
+    """Minus the log density (n,) of detections around each: half uniform over the room, half a kernel estimate."""
+    n = len(p)
+    h2 = 0.25**2 * (room / np.pi if dims == 2 else (0.75 * room / np.pi) ** (2.0 / 3.0))
+    norm = (2 * np.pi * h2) ** (-0.5 * dims)
+    out = np.empty(n)
+    for i in range(n):
+        near = 0.0
+        for j in range(n):
+            if j != i:
+                d2 = 0.0
+                for a in range(dims):
+                    d2 += (p[i, a] - p[j, a]) ** 2
+                near += np.exp(-0.5 * d2 / h2)
+        density = 0.5 * n / room + 0.5 * near * norm * n / max(n - 1, 1)
+        out[i] = -np.log(density)
+    return out
+
+
+@njit(cache=True)
+def with_robot(p: Array, S: Array, std: float, height_variance: float) -> tuple[Array, Array]:
+    """Positions and covariances with the robot itself appended, at the origin."""
+    n = len(p)
+    p_out, S_out = np.zeros((n + 1, 3)), np.zeros((n + 1, 3, 3))
+    p_out[:n] = p
+    S_out[:n] = S
+    S_out[n, 0, 0] = S_out[n, 1, 1] = std * std
+    S_out[n, 2, 2] = height_variance
+    return p_out, S_out
+
+
+@njit(cache=True)
+def bias_vectors(p: Array, top: Indices, classes: Indices, side: int, scaled: bool) -> Array:
+    """How each bias moves each object (n + 1, nb, 3): an offset along the ray per class, a scale per robot."""
+    n = len(p) - 1
+    nc = len(classes)
+    B = np.zeros((n + 1, nc + 2 if scaled else nc, 3))
+    for i in range(n):
+        r = np.sqrt(p[i, 0] ** 2 + p[i, 1] ** 2 + p[i, 2] ** 2) + 1e-12
+        for c in range(nc):
+            if classes[c] == top[i]:
+                B[i, c] = p[i] / r
+        if scaled:
+            B[i, nc + side] = p[i]
+    return B
+
+
+@njit(cache=True)
+def prepare(
+    positions_a: Array,
+    depth_a: Array,
+    covariances_a: Array,
+    classes_a: Array,
+    class_variance_a: Array,
+    L_a: Array,
+    positions_b: Array,
+    depth_b: Array,
+    covariances_b: Array,
+    classes_b: Array,
+    class_variance_b: Array,
+    L_b: Array,
+    bearing_variance: float,
+    gravity: bool,
+    cameras: bool,
+    seen: bool,
+    q: Settings,
+) -> Problem:
+    """Assemble the problem. `cameras`: detections come from images: biased depth, objects of some extent."""
+    n, m = len(positions_a), len(positions_b)
+    p_a, S_a, p_b, S_b = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((m, 3)), np.empty((m, 3, 3))
+    level(positions_a, depth_a, covariances_a, bearing_variance, L_a, p_a, S_a)
+    level(positions_b, depth_b, covariances_b, bearing_variance, L_b, p_b, S_b)
+    distance = ranges(positions_a, positions_b)
+    median_range = max(distance[(n + m) // 2], 1e-3)
+    if cameras:
+        allow_for_extent(p_a, S_a, q.extent * median_range, q.depth_offset * median_range)
+        allow_for_extent(p_b, S_b, q.extent * median_range, q.depth_offset * median_range)
+    likely = np.full((n + 1, m + 1), -1e9)
+    attributes = np.zeros((n, m))
+    top_a, top_b = np.zeros(n, np.int64), np.zeros(m, np.int64)
+    class_evidence(
+        classes_a,
+        class_variance_a,
+        classes_b,
+        class_variance_b,
+        q.class_sharpness,
+        q.mislabel,
+        attributes,
+        top_a,
+        top_b,
+    )
+    likely[:n, :m] = attributes
+    height = height_variance = robot_height_log = 0.0
+    robot_std = q.robot_extent * median_range
+    robot_variance = robot_std**2
+    if gravity:
+        variance, mean_a, mean_b = height_spread(p_a, S_a, p_b, S_b)
+        shrink_heights(p_a, S_a, mean_a, variance)
+        shrink_heights(p_b, S_b, mean_b, variance)
+        height_correction(p_a, S_a, mean_a, p_b, S_b, mean_b, variance, attributes)
+        room_a, room_b = spread_area(p_a), spread_area(p_b)
+        height = mean_a - mean_b
+        height_variance = 2.0 * variance * (1.0 / n + 1.0 / m) + 1e-6
+        # The height of a robot's sensor says nothing of the height at which the other sees the robot.
+        robot_variance = 1e4 * median_range**2
+        robot_height_log = 0.5 * np.log(2 * np.pi * robot_variance)
+    else:
+        room_a, room_b = spread_volume(p_a, S_a), spread_volume(p_b, S_b)
+    log_a = log_room_per_object(p_a, room_a, 2 if gravity else 3)
+    log_b = log_room_per_object(p_b, room_b, 2 if gravity else 3)
+    static = np.full((n + 1, m + 1), -1e9)
+    for i in range(n):
+        for j in range(m):
+            static[i, j] = attributes[i, j] + 0.5 * (log_a[i] + log_b[j])
+    if seen:
+        for i in range(n):
+            static[i, m] = log_a[i] + robot_height_log
+            likely[i, m] = 0.0
+        for j in range(m):
+            static[n, j] = log_b[j] + robot_height_log
+            likely[n, j] = 0.0
+    p_a, S_a = with_robot(p_a, S_a, robot_std, robot_variance)
+    p_b, S_b = with_robot(p_b, S_b, robot_std, robot_variance)
+    offset = cameras and q.depth_offset_std > 0
+    scaled = q.scale_std > 0
+    classes = np.unique(np.concatenate((top_a, top_b))) if offset else np.zeros(0, np.int64)
+    B_a, B_b = bias_vectors(p_a, top_a, classes, 0, scaled), bias_vectors(p_b, top_b, classes, 1, scaled)
+    precision = np.empty(B_a.shape[1])
+    precision[:] = 1.0 / max(q.depth_offset_std * median_range, 1e-9) ** 2
+    if scaled:
+        precision[len(classes) :] = 1.0 / q.scale_std**2
+    return Problem(
+        p_a, S_a, B_a, p_b, S_b, B_b, precision, static, likely, height, height_variance, room_a, room_b, median_range
+    )
+
+
+@njit(cache=True)
+def allow_for_extent(p: Array, S: Array, extent: float, offset: float) -> None:
+    """Push detections outwards by `offset` (m) and widen them: what is seen is a face of the object, not its centre.
+
+    The height of the visible part's centre says even less: its deviation counts fourfold.
+    """
+    for i in range(len(p)):
+        r = np.sqrt(p[i, 0] ** 2 + p[i, 1] ** 2 + p[i, 2] ** 2) + 1e-12
+        for a in range(3):
+            p[i, a] *= 1.0 + offset / r
+            S[i, a, a] += extent * extent * (16.0 if a == 2 else 1.0)

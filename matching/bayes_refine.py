@@ -7,10 +7,14 @@ is Gaussian in them, given as a precision about a mean state (zero rows: flat).
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
 
 from .bayes_assignment import assignment_marginals
+from .bayes_prepare import Settings
+from .bayes_view import View, detection_probability
 from .pose import Array
 
 LOG_2PI = float(np.log(2 * np.pi))
@@ -95,6 +99,8 @@ def residual_edges(
     t: Array,
     bias: Array,
     temper: float,
+    bonus_a: Array,
+    bonus_b: Array,
     min_log_weight: float,
     rows: Array,
     cols: Array,
@@ -160,7 +166,7 @@ def residual_edges(
             chi2 = wxx * x * x + wyy * y * y + wzz * z * z + 2 * (wxy * x * y + wxz * x * z + wyz * y * z)
             if chi2 > max_chi2:
                 continue
-            w = static[i, j] - 0.5 * (chi2 + np.log(det)) - 1.5 * LOG_2PI
+            w = bonus_a[i] + bonus_b[j] + static[i, j] - 0.5 * (chi2 + np.log(det)) - 1.5 * LOG_2PI
             if w < min_log_weight:
                 continue
             rows[e], cols[e], log_weights[e] = i, j, w
@@ -223,6 +229,91 @@ def normal_equations(
 
 
 @njit(cache=True)
+def overlap_log_prior(k: float, n: int, m: int, q: Settings) -> float:
+    """Log prior of one set of k matches among n and m objects, densities of objects set aside.
+
+    k of min(n, m) is beta-binomial; all sets of k matches are equally likely; every match has a bonus.
+    """
+    small = min(n, m)
+    a, b = q.overlap_alpha, q.overlap_beta
+    k = min(k, float(small))
+    out = math.lgamma(small + 1.0) - math.lgamma(k + 1.0) - math.lgamma(small - k + 1.0)
+    out += math.lgamma(k + a) + math.lgamma(small - k + b) - math.lgamma(small + a + b)
+    out -= math.lgamma(a) + math.lgamma(b) - math.lgamma(a + b)
+    out += math.lgamma(n - k + 1.0) + math.lgamma(m - k + 1.0) + math.lgamma(k + 1.0)
+    out -= math.lgamma(n + 1.0) + math.lgamma(m + 1.0)
+    return out + k * (0.5 * np.log(n * m) + q.match_bonus)
+
+
+@njit(cache=True)
+def overlap_log_odds(k: float, n: int, m: int, q: Settings) -> float:
+    """Slope of `overlap_log_prior` in k: what the prior gives to one more match."""
+    step = 0.5
+    low = max(0.0, k - step)
+    high = min(float(min(n, m)), k + step)
+    if not high > low:
+        return q.initial_log_odds
+    slope = (overlap_log_prior(high, n, m, q) - overlap_log_prior(low, n, m, q)) / (high - low)
+    return min(max(slope, -1.0), 4.0)
+
+
+@njit(cache=True)
+def view_bonus(
+    p_a: Array,
+    p_b: Array,
+    R: Array,
+    t: Array,
+    view_a: View,
+    view_b: View,
+    log_bonus: float,
+    bonus_a: Array,
+    bonus_b: Array,
+) -> float:
+    """What both fields of view say under a pose: parts of every match's log weight, and what stays when none is made.
+
+    An object of the source that the target detects with probability d counts 1 - d when it stays alone; a match has
+    sqrt(d e) instead. The Poisson void term is the expected number of common objects. The last object of either side is
+    the robot itself, which is known to be there.
+    """
+    n, m = len(p_a), len(p_b)
+    total = 0.0
+    for i in range(n):
+        x, y, z = p_a[i, 0] - t[0], p_a[i, 1] - t[1], p_a[i, 2] - t[2]
+        d = detection_probability(
+            R[0, 0] * x + R[1, 0] * y + R[2, 0] * z,
+            R[0, 1] * x + R[1, 1] * y + R[2, 1] * z,
+            R[0, 2] * x + R[1, 2] * y + R[2, 2] * z,
+            view_b,
+            p_b,
+        )
+        alone = np.log(1.0 - d)
+        if i == n - 1:
+            bonus_a[i] = np.log(d) - alone
+            total += alone
+        else:
+            bonus_a[i] = 0.5 * (np.log(d) + log_bonus) - alone
+            total += alone + 0.5 * d
+    for j in range(m):
+        x, y, z = p_b[j, 0], p_b[j, 1], p_b[j, 2]
+        d = detection_probability(
+            R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0],
+            R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1],
+            R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2],
+            view_a,
+            p_a,
+        )
+        alone = np.log(1.0 - d)
+        if j == m - 1:
+            bonus_b[j] = np.log(d) - alone
+            total += alone
+        else:
+            bonus_b[j] = 0.5 * (np.log(d) + log_bonus) - alone
+            total += alone + 0.5 * d
+    # A robot that was matched replaces nothing of its partner but "stays alone".
+    return total
+
+
+@njit(cache=True)
 def refine(
     p_a: Array,
     S_a: Array,
@@ -241,6 +332,9 @@ def refine(
     nr: int,
     tempers: Array,
     max_iterations: int,
+    q: Settings,
+    view_a: View,
+    view_b: View,
     marginals: Array,
     information: Array,
 ) -> float:
@@ -257,7 +351,18 @@ def refine(
     H, g, factor = np.empty((d, d)), np.empty(d), np.empty((d, d))
     offset, w = np.empty(d), np.empty(3)
     evidence = -1e300
+    log_odds = q.initial_log_odds
+    # The last object of either side is the robot itself.
+    n0, m0 = n - 1, m - 1
+    seen = view_a.known > 0 and view_b.known > 0
+    bonus_a, bonus_b = np.empty(n), np.empty(m)
     for iteration in range(max_iterations + 1):
+        void = 0.0
+        bonus_a[:] = log_odds
+        bonus_b[:] = 0.0
+        bonus_a[n0], bonus_b[m0] = 0.0, -log_odds
+        if seen:
+            void = view_bonus(p_a, p_b, R, t, view_a, view_b, q.view_bonus, bonus_a, bonus_b)
         temper = tempers[min(iteration, len(tempers) - 1)]
         n_edges = residual_edges(
             p_a,
@@ -271,6 +376,8 @@ def refine(
             t,
             bias,
             temper,
+            bonus_a,
+            bonus_b,
             -6.0,
             rows,
             cols,
@@ -313,13 +420,23 @@ def refine(
         cholesky_solve(factor, offset, d)
         for a in range(d):
             decrement += g[a] * offset[a]
+        common = 0.0
+        for e in range(n_edges):
+            if rows[e] < n0 and cols[e] < m0:
+                common += probability[e]
         final = iteration == max_iterations or (iteration >= len(tempers) - 1 and decrement < 1e-3)
         if final:
             half_logdet = 0.0
             for a in range(d):
                 half_logdet += np.log(factor[a, a])
             evidence = log_z - penalty + prior_log_norm + 0.5 * d * LOG_2PI - half_logdet
+            if seen:
+                evidence += void
+            else:
+                evidence += overlap_log_prior(common, n0, m0, q) - log_odds * common
             break
+        if iteration >= 1:
+            log_odds = overlap_log_odds(common, n0, m0, q)
         # A turn beyond half a radian is outside what Gauss-Newton sees.
         size = 0.0
         for a in range(nr):
@@ -342,10 +459,20 @@ def refine(
 
 @njit(cache=True)
 def screen_spatial(
-    p_a: Array, S_a: Array, p_b: Array, S_b: Array, static: Array, R: Array, t: Array, temper: float, scores: Array
+    p_a: Array,
+    S_a: Array,
+    p_b: Array,
+    S_b: Array,
+    static: Array,
+    R: Array,
+    t: Array,
+    temper: float,
+    log_odds: float,
+    scores: Array,
 ) -> None:
     """Score poses in SE(3), like `screen`: the smaller of the two robots' sums of best positive log weights."""
     n, m = static.shape
+    bonus_a, bonus_b = np.full(n, log_odds), np.zeros(m)
     none_a, none_b, no_bias = np.zeros((n, 0, 3)), np.zeros((m, 0, 3)), np.zeros(0)
     rows, cols, logs = np.empty(n * m, np.int64), np.empty(n * m, np.int64), np.empty(n * m)
     residuals, weights, mapped = np.empty((n * m, 3)), np.empty((n * m, 6)), np.empty((m, 3))
@@ -362,6 +489,8 @@ def screen_spatial(
             t[k],
             no_bias,
             temper,
+            bonus_a,
+            bonus_b,
             0.0,
             rows,
             cols,
