@@ -22,6 +22,7 @@ from .paint import (
     Image,
     blend,
     class_color,
+    cross,
     disc,
     identity_colors,
     polygon,
@@ -210,7 +211,7 @@ def _estimates(picture: Image, answered: Answered, area: Area) -> None:
                 _soft_disc(picture, pixels[k], min(spread, area.size / 4), color)
                 disc(picture, pixels[k], 3.2, color)
             elif (i, int(k)) in wrong:
-                _cross(picture, pixels[k], WRONG)
+                cross(picture, pixels[k], WRONG)
             else:
                 disc(picture, pixels[k], 1.6, FAINT)
 
@@ -232,11 +233,6 @@ def _soft_disc(picture: Image, centre: Array, radius: float, color: Color) -> No
     inside = np.clip(radius - np.hypot(rows, columns) + 0.5, 0, 1)
     rim = np.clip(1.2 - np.abs(radius - np.hypot(rows, columns)), 0, 1)
     blend(window, np.maximum(0.2 * inside, 0.8 * rim), color)
-
-
-def _cross(picture: Image, at: Array, color: Color) -> None:
-    for slope in (1.0, -1.0):
-        polyline(picture, at + np.array([[-4.0, -4 * slope], [4.0, 4 * slope]]), color, 2)
 
 
 def _observer(picture: Image, T_world_camera: Array, i: int, area: Area) -> None:

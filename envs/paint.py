@@ -150,6 +150,12 @@ def disc(picture: Image, centre: Array, radius: float, color: Color, width: int 
     cv2.circle(picture, (u, v), round(radius * (1 << SHIFT)), color, width, cv2.LINE_AA, SHIFT)
 
 
+def cross(picture: Image, at: Array, color: Color, half: float = 4.0) -> None:
+    """A cross like an x."""
+    for slope in (half, -half):
+        polyline(picture, at + np.array([[-half, -slope], [half, slope]]), color, 2)
+
+
 def dashes(picture: Image, start: Array, end: Array, color: Color, width: int = 2, dash: float = 8.0) -> None:
     """A dashed straight line."""
     steps = max(int(np.linalg.norm(end - start) // dash), 1)

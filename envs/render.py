@@ -15,6 +15,7 @@ from .paint import (
     CANVAS,
     FAINT,
     GAP,
+    IDENTITY_COLORS,
     INK,
     RIGHT,
     WRONG,
@@ -26,6 +27,7 @@ from .paint import (
     blank,
     blend,
     corners,
+    cross,
     dashes,
     disc,
     identity_colors,
@@ -118,8 +120,43 @@ def _cameras(instant: Instant, answered: Answered | None) -> Image:
         for i in range(n)
     ]
     while len(cells) % columns:
-        cells.append(blank(cells[-1].shape[1], cells[-1].shape[0]))
+        cells.append(_key(cells[-1].shape[1], cells[-1].shape[0]))
     return below([beside(cells[k : k + columns]) for k in range(0, len(cells), columns)])
+
+
+def _key(width: int, height: int) -> Image:
+    """What the marks mean, where a camera's place is free."""
+    picture = blank(width, height)
+    example = IDENTITY_COLORS[1]
+    step = min(34, height // 8)
+    v = (height - 6 * step) // 2 + step // 2
+    for words in (
+        "matched right, one colour per object",
+        "matched wrong",
+        "detected, not matched",
+        "fused estimate, 1 sigma, error",
+        "estimate of a wrong match",
+        "object, motion; colour of its class",
+    ):
+        centre = np.array([30.0, v])
+        box = np.concatenate([centre - (11, 8), centre + (11, 8)])
+        outline = box[[0, 1, 2, 1, 2, 3, 0, 3]].reshape(4, 2)
+        if words.startswith("matched right"):
+            polyline(picture, outline, example, 2, closed=True)
+        elif words.startswith(("matched wrong", "detected")):
+            corners(picture, box, *((INK, 1) if words.startswith("detected") else (WRONG, 2)))
+        elif words.startswith("fused"):
+            polyline(picture, centre + [[-13, 7], [3, -1]], example, 1)
+            disc(picture, centre + (3, -1), 7, example, 1)
+            disc(picture, centre + (3, -1), 3.2, example)
+        elif words.startswith("estimate"):
+            cross(picture, centre, WRONG)
+        else:
+            polyline(picture, outline - (4, 0), INK, 1, closed=True)
+            polyline(picture, centre + [[7, 0], [17, 0]], INK, 1)
+        text(picture, words, (58, v + 5), 14, FAINT)
+        v += step
+    return picture
 
 
 def _camera(instant: Instant, i: int, answered: Answered | None, size: tuple[int, int]) -> Image:
