@@ -122,7 +122,7 @@ class ConnectedDrivingWorld:
         episode = self._running()
         n, street = self.n_robots, episode.street
         vehicles = [*episode.connected, *(v for v in episode.road.vehicles if not isinstance(v, ConnectedVehicle))]
-        positions = np.vstack([to_world(np.array([v.position for v in vehicles])), *street.objects.positions])
+        positions = np.vstack([to_world(np.array([v.position for v in vehicles])), street.objects.places()])
         headings = np.array([-v.heading for v in vehicles] + street.objects.headings)
         sizes = np.array([KINDS[v.kind].size for v in vehicles] + street.objects.sizes)
         m = len(positions)
@@ -134,7 +134,7 @@ class ConnectedDrivingWorld:
         looks = [episode.looks[v.identity] for v in vehicles]
         scenery = street.scenery
         poses = planar_poses(
-            np.vstack([positions, *scenery.positions, *self._obstacle_positions(), np.zeros((1, 2))]),
+            np.vstack([positions, scenery.places(), to_world(self.map.obstacles), np.zeros((1, 2))]),
             np.concatenate([headings, scenery.headings, np.zeros(len(self.map.obstacles) + 1)]),
         )
         fixed = [self._surface - 1] * len(self.map.obstacles) + [self._surface]
@@ -236,7 +236,7 @@ class ConnectedDrivingWorld:
         crossers = {}
         for k, walker in enumerate(episode.street.walkers):
             if walker.on_road:
-                position = to_world(walker.site()[0])
+                position = to_world(np.array(walker.site()[0]))
                 crossers[k] = episode.crossers.get(k) or _pedestrian_obstacle(episode.road, position)
                 crossers[k].position = position
         episode.crossers = crossers
@@ -353,9 +353,6 @@ class ConnectedDrivingWorld:
             return used[int(rng.integers(len(used)))]
         return fresh[int(rng.integers(len(fresh)))]
 
-    def _obstacle_positions(self) -> list[Array]:
-        return [to_world(position) for position in self.map.obstacles]
-
 
 def planar_poses(positions: Array, headings: Array) -> Array:
     """T_world_body (n, 4, 4) of bodies standing at positions (n, 2) m with headings (n,) rad."""
@@ -414,7 +411,7 @@ def _cars(vehicles: list[ConnectedVehicle]) -> Array:
 
 
 def _pedestrians(street: Street) -> Array:
-    return street.objects.footprints()[len(street.objects) - len(street.walkers) :]
+    return street.objects.footprints(len(street.objects) - len(street.walkers))
 
 
 def _pedestrian_obstacle(road: FastRoad, position: Array) -> Obstacle:

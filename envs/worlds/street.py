@@ -45,6 +45,9 @@ AMBER_S, RED_S = 1.0, 2.0
 PAUSE_S = 2.0
 SITE_TRIES = 12
 
+Site = tuple[tuple[float, float], float]
+"""A place (x, y) m and a heading rad."""
+
 
 @dataclass(frozen=True)
 class Catalogue:
@@ -62,15 +65,15 @@ class Catalogue:
 class Things:
     """n things standing on the ground: positions (n, 2) m, headings rad, classes, sizes (n, 3) m, meshes and tints."""
 
-    positions: list[Array] = field(default_factory=list)
+    positions: list[tuple[float, float]] = field(default_factory=list)
     headings: list[float] = field(default_factory=list)
     classes: list[int] = field(default_factory=list)
     sizes: list[Size] = field(default_factory=list)
     meshes: list[int] = field(default_factory=list)
     tints: list[Tint] = field(default_factory=list)
 
-    def add(self, site: tuple[Array, float], kind: int, size: Size, mesh: int, tint: Tint) -> None:
-        """Append one, at a position (2,) m and heading."""
+    def add(self, site: Site, kind: int, size: Size, mesh: int, tint: Tint) -> None:
+        """Append one."""
         self.positions.append(site[0])
         self.headings.append(site[1])
         self.classes.append(kind)
@@ -81,10 +84,14 @@ class Things:
     def __len__(self) -> int:
         return len(self.positions)
 
-    def footprints(self) -> Array:
-        """(n, 5) x, y, heading, length, width."""
-        rows = [(*p, h, size[0], size[1]) for p, h, size in zip(self.positions, self.headings, self.sizes, strict=True)]
-        return np.array(rows, dtype=np.float64).reshape(-1, 5)
+    def places(self) -> Array:
+        """(n, 2) m."""
+        return np.array(self.positions, dtype=np.float64).reshape(-1, 2)
+
+    def footprints(self, first: int = 0) -> Array:
+        """(n, 5) x, y, heading, length, width, from the thing of that index on."""
+        sizes = np.array(self.sizes[first:], dtype=np.float64).reshape(-1, 3)
+        return np.column_stack([self.places()[first:], self.headings[first:], sizes[:, :2]])
 
 
 @dataclass
@@ -136,15 +143,15 @@ class Walker:
         """Whether it stands between the kerbs."""
         return self.crossing >= 0 and WALK_M - 0.5 < self.at < len(self.path) - 0.5 - WALK_M
 
-    def site(self) -> tuple[Array, float]:
-        """Position (2,) m and heading rad."""
+    def site(self) -> Site:
+        """Where it stands."""
         k = min(int(self.at), len(self.path) - 2)
         (ax, ay), (bx, by) = self.path[k].tolist(), self.path[k + 1].tolist()
         dx, dy = bx - ax, by - ay
         length, t = math.hypot(dx, dy), self.at - k
         x = ax + t * dx - self.lateral * dy / length
         y = ay + t * dy + self.lateral * dx / length
-        return np.array([x, y]), math.atan2(dy, dx) + (math.pi if self.pace < 0 else 0.0)
+        return (x, y), math.atan2(dy, dx) + (math.pi if self.pace < 0 else 0.0)
 
     def walk(self, dt: float, road_is_safe: Callable[[Array], bool]) -> None:
         """Go on for `dt` s; turn back at the ends, and step onto the road only when it is safe there."""
@@ -206,20 +213,20 @@ class Street:
     def velocities(self) -> Array:
         """(n, 2) m/s of the objects."""
         out = np.zeros((len(self.objects), 2))
-        for k, walker in enumerate(self.walkers, len(self.objects) - len(self.walkers)):
-            heading = self.objects.headings[k]
-            out[k] = walker.speed * math.cos(heading), walker.speed * math.sin(heading)
+        first = len(self.objects) - len(self.walkers)
+        speeds, headings = np.array([walker.speed for walker in self.walkers]), np.array(self.objects.headings[first:])
+        out[first:, 0], out[first:, 1] = speeds * np.cos(headings), speeds * np.sin(headings)
         return out
 
     # --- generation ---------------------------------------------------------------------------------------------------
 
-    def _find_signals(self) -> list[tuple[Array, float]]:
+    def _find_signals(self) -> list[Site]:
         """Sites of the signals: at the crossings first, then anywhere along the kerbs."""
-        sites = []
-        for crossing, position, heading in self._ground.posts[: self._params.n_signals]:
-            self._taken.append((float(position[0]), float(position[1]), 0.8))
+        sites: list[Site] = []
+        for crossing, (x, y), heading in self._ground.posts[: self._params.n_signals]:
+            self._taken.append((float(x), float(y), 0.8))
             self.signals.append(Signal(crossing))
-            sites.append((position, heading))
+            sites.append(((float(x), float(y)), heading))
         for _ in range(self._params.n_signals - len(sites)):
             site = self._site(math.pi, POST_M, 1.5)
             if site is not None:
@@ -295,7 +302,7 @@ class Street:
         room: float = 0.0,
         parking: bool = False,
         islands: bool = False,
-    ) -> tuple[Array, float] | None:
+    ) -> Site | None:
         """A free site `outward` m from a kerb, heading along the traffic plus `turn`; None after a few tries."""
         sites = self._ground.sites(outward, max(room, outward), parking=parking, islands=islands)
         if len(sites) == 0:
@@ -305,7 +312,7 @@ class Street:
             x, y, heading = sites[int(np.searchsorted(cumulative, self._rng.uniform() * cumulative[-1]))].tolist()
             if all((x - a) ** 2 + (y - b) ** 2 >= (radius + r) ** 2 for a, b, r in self._taken):
                 self._taken.append((x, y, radius))
-                return np.array([x, y]), heading + turn
+                return (x, y), heading + turn
         return None
 
     def _weights(self, places: Array, wider: float) -> Array:
