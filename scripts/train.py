@@ -25,7 +25,7 @@ def perception(
     steps: Annotated[int | None, typer.Option(help="Stop after so many steps instead.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")] = False,
     seed: Annotated[int, typer.Option(help="Of frames, batches, dropout and first weights.")] = 0,
-    threads: Annotated[int, typer.Option(help="Threads of torch.")] = 2,
+    workers: Annotated[int, typer.Option(help="Processes that learn side by side, one thread each.")] = 2,
     validation_images: Annotated[int, typer.Option(help="Per scene, for figures on the way; 0 = none.")] = 16,
     calibration_images: Annotated[int, typer.Option(help="Per scene, to calibrate uncertainty; 0 = do not.")] = 120,
 ) -> None:
@@ -42,10 +42,8 @@ def perception(
         from ..agents.perception.training import TrainingParams, train
         from ..evaluation.perception_training import finish, validation_figures
 
-        if threads < 1:
-            raise ValueError(f"threads must be at least 1, got {threads}")
-        torch.set_num_threads(threads)
-        params = TrainingParams(minutes=None if steps else minutes, steps=steps, seed=seed)
+        torch.set_num_threads(1)
+        params = TrainingParams(minutes=None if steps else minutes, steps=steps, seed=seed, workers=workers)
         state = train(
             params,
             out,

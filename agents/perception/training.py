@@ -1,4 +1,9 @@
-"""Training of the learned eyes: frames rendered on the fly, atomic checkpoints, resumable at any point."""
+"""Training of the learned eyes: frames rendered on the fly, atomic checkpoints, resumable at any point.
+
+Several workers, each a process with one thread and frames of its own, meet every few steps to average their weights.
+On two cores that is twice as fast as one worker; threads inside the small tensor operations of one process are hardly
+faster than one thread, and several times slower where other programs use the cores too.
+"""
 
 from __future__ import annotations
 
@@ -6,15 +11,16 @@ import ctypes
 import json
 import math
 import os
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from .frames import Frame, FrameSource, Variant, joint_classes, training_variants
 from .losses import LossWeights, losses, make_batch
@@ -35,7 +41,9 @@ class TrainingParams:
         steps: number of steps instead of a time.
         seed: of frames, batches, dropout and first weights.
         pairs: pairs of frames per batch.
-        pool_chunks: chunks of frames kept at hand.
+        workers: processes that learn side by side.
+        meet_every: steps between two averagings of the workers' weights.
+        pool_chunks: chunks of frames kept at hand, by each worker.
         steps_per_chunk: how often the oldest chunk is replaced by a new one.
         learning_rate: at its highest.
         warm_up: share of the training over which it rises.
@@ -51,6 +59,8 @@ class TrainingParams:
     steps: int | None = None
     seed: int = 0
     pairs: int = 4
+    workers: int = 1
+    meet_every: int = 16
     pool_chunks: int = 60
     steps_per_chunk: int = 2
     learning_rate: float = 1.5e-3
@@ -66,7 +76,16 @@ class TrainingParams:
     def __post_init__(self) -> None:
         if (self.minutes is None) == (self.steps is None):
             raise ValueError(f"give minutes or steps, got minutes={self.minutes} and steps={self.steps}")
-        for name in ("minutes", "steps", "pairs", "pool_chunks", "steps_per_chunk", "learning_rate"):
+        for name in (
+            "minutes",
+            "steps",
+            "pairs",
+            "workers",
+            "meet_every",
+            "pool_chunks",
+            "steps_per_chunk",
+            "learning_rate",
+        ):
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ValueError(f"{name} must be positive, got {value}")
@@ -75,16 +94,22 @@ class TrainingParams:
 
 
 class Pool:
-    """The last chunks of a source, so that each frame is seen a few times at the price of one rendering."""
+    """The last chunks of a source, so that each frame is seen a few times at the price of one rendering.
 
-    def __init__(self, source: FrameSource, size: int) -> None:
+    Of the source's chunks every worker has its own share: each `workers`-th, from number `worker` on.
+    """
+
+    def __init__(self, source: FrameSource, size: int, worker: int = 0, workers: int = 1) -> None:
         self.source, self.size = source, size
+        self.worker, self.workers = worker, workers
         self.chunks: dict[int, list[Pair]] = {}
 
     def at(self, newest: int) -> list[Pair]:
         """All pairs of the chunks up to number `newest`; the same whether the pool has just begun or run for long."""
         wanted = range(newest - self.size + 1, newest + 1)
-        self.chunks = {n: self.chunks[n] if n in self.chunks else self.source.chunk(n % 2**31) for n in wanted}
+        self.chunks = {
+            n: self.chunks[n] if n in self.chunks else self.source.chunk(n * self.workers + self.worker) for n in wanted
+        }
         return [pair for n in wanted for pair in self.chunks[n]]
 
 
@@ -139,42 +164,175 @@ def train(
     state = fresh(params, network)
     if path.exists():
         load_checkpoint(path, state)
-    pool = Pool(FrameSource(seed=params.seed, variants=params.variants), params.pool_chunks)
-    loggers = [_json_logger(out / LOG), *_tensorboard(out)]
-    began, before = time.monotonic(), state.seconds
-    saved = validated = reported = state.seconds
-    sums: dict[str, float] = {}
-    since = 0
-    state.network.train()
-    while (done := _progress(state, params)) < 1:
-        values = train_step(state, pool, params, done)
-        state.seconds = before + time.monotonic() - began
-        since += 1
-        for name, value in values.items():
-            sums[name] = sums.get(name, 0.0) + value
-        if state.seconds - reported >= report_s or _progress(state, params) >= 1:
-            row: dict[str, Any] = {"step": state.step, "seconds": round(state.seconds, 1), "done": round(done, 4)}
-            row["images"] = state.images
-            row["images_per_s"] = round(2 * params.pairs * since / max(state.seconds - reported, 1e-9), 2)
-            row |= {name: round(value / since, 5) for name, value in sums.items()}
-            if validate is not None and (
-                state.seconds - validated >= params.validate_s or _progress(state, params) >= 1
-            ):
-                row |= {f"val_{k}": v for k, v in validate(state.averaged).items()}
-                validated = state.seconds = before + time.monotonic() - began
-            for log in [*loggers, report]:
-                log(row)
-            reported, sums, since = state.seconds, {}, 0
-        if state.seconds - saved >= params.checkpoint_s:
-            save_checkpoint(path, state)
-            saved = state.seconds
+    pool = _pool(params, 0)
+    book = _Book(params, state, path, [_json_logger(out / LOG), *_tensorboard(out), report], validate, report_s)
+    with _Team(params, state) as team:
+        while team.begin(done := _progress(state, params)):
+            for _ in range(team.steps(state)):
+                book.enter(train_step(state, pool, params, done), done)
+            team.meet(0, state.network)
     save_checkpoint(path, state)
     return state
 
 
-def train_step(state: State, pool: Pool, params: TrainingParams, done: float) -> dict[str, float]:
-    """One step; which frames, augmentations and dropout it uses follows from seed and step alone."""
-    rng = np.random.default_rng([params.seed, 17, state.step])
+class _Book:
+    """Keeps time, means of the losses, reports, validations and checkpoints of one session."""
+
+    def __init__(
+        self,
+        params: TrainingParams,
+        state: State,
+        path: Path,
+        logs: Sequence[Callable[[dict[str, Any]], None]],
+        validate: Callable[[Eyes], dict[str, float]] | None,
+        report_s: float,
+    ) -> None:
+        self.params, self.state, self.path = params, state, path
+        self.logs, self.validate, self.report_s = logs, validate, report_s
+        self.began, self.before = time.monotonic(), state.seconds
+        self.saved = self.validated = self.reported = state.seconds
+        self.sums: dict[str, float] = {}
+        self.since = 0
+
+    def enter(self, values: dict[str, float], done: float) -> None:
+        """After every step."""
+        self._tell_time()
+        self.since += 1
+        for name, value in values.items():
+            self.sums[name] = self.sums.get(name, 0.0) + value
+        over = _progress(self.state, self.params) >= 1
+        if over or self.state.seconds - self.reported >= self.report_s:
+            self._report(done, over)
+        if self.state.seconds - self.saved >= self.params.checkpoint_s:
+            save_checkpoint(self.path, self.state)
+            self.saved = self.state.seconds
+
+    def _tell_time(self) -> None:
+        self.state.seconds = self.before + time.monotonic() - self.began
+
+    def _report(self, done: float, over: bool) -> None:
+        state, params = self.state, self.params
+        images = 2 * params.pairs * params.workers * self.since
+        row: dict[str, Any] = {
+            "step": state.step,
+            "seconds": round(state.seconds, 1),
+            "done": round(done, 4),
+            "images": state.images,
+            "images_per_s": round(images / max(state.seconds - self.reported, 1e-9), 2),
+            **{name: round(value / self.since, 5) for name, value in self.sums.items()},
+        }
+        if self.validate is not None and (over or state.seconds - self.validated >= params.validate_s):
+            row |= {f"val_{k}": v for k, v in self.validate(state.averaged).items()}
+            self._tell_time()
+            self.validated = state.seconds
+        for log in self.logs:
+            log(row)
+        self.reported, self.sums, self.since = state.seconds, {}, 0
+
+
+class _Team:
+    """The other workers, and where all of them put their weights to be averaged."""
+
+    def __init__(self, params: TrainingParams, state: State) -> None:
+        self.params = params
+        self.processes: list[Any] = []
+        if params.workers == 1:
+            return
+        context = torch.multiprocessing.get_context("spawn")
+        self.flat = torch.stack([_flat(state.network)] * params.workers).share_memory_()
+        self.plan = torch.zeros(2, dtype=torch.float64).share_memory_()  # share done, steps until the next meeting
+        self.barrier = context.Barrier(params.workers, timeout=MEETING_TIMEOUT_S)
+        for worker in range(1, params.workers):
+            arguments = (worker, params, state.network.params, state.step, self.flat, self.plan, self.barrier)
+            process = context.Process(target=_work, args=arguments, daemon=True)
+            process.start()
+            self.processes.append(process)
+
+    def __enter__(self) -> _Team:
+        return self
+
+    def __exit__(self, kind: Any, *_: Any) -> None:
+        if self.processes and kind is not None:
+            self.barrier.abort()
+        for process in self.processes:
+            process.join()
+
+    def steps(self, state: State) -> int:
+        """How many steps until the next meeting."""
+        if not self.processes:
+            return 1
+        return int(self.plan[1])
+
+    def begin(self, done: float) -> bool:
+        """Tell the workers how far the training is; False when it is over."""
+        if self.processes:
+            self.plan[0] = done
+            self.plan[1] = self.params.meet_every
+            self.barrier.wait()
+        return done < 1
+
+    def meet(self, worker: int, network: Eyes) -> None:
+        """Average the weights of all workers."""
+        if self.processes:
+            _meet(worker, network, self.flat, self.barrier)
+
+
+MEETING_TIMEOUT_S = 900.0
+
+
+def _work(
+    worker: int, params: TrainingParams, network: NetworkParams, step: int, flat: Tensor, plan: Tensor, barrier: Any
+) -> None:
+    """The life of a worker but the first."""
+    torch.set_num_threads(1)
+    keep_memory()
+    state = fresh(params, network)
+    state.step = step
+    _unflatten(flat[0], state.network)
+    pool = _pool(params, worker)
+    state.network.train()
+    try:
+        while True:
+            barrier.wait()
+            done, steps = plan.tolist()
+            if done >= 1:
+                return
+            for _ in range(int(steps)):
+                train_step(state, pool, params, done, worker)
+            _meet(worker, state.network, flat, barrier)
+    except threading.BrokenBarrierError:
+        return
+
+
+def _meet(worker: int, network: Eyes, flat: Tensor, barrier: Any) -> None:
+    flat[worker] = _flat(network)
+    barrier.wait()
+    mean = flat.mean(0)
+    barrier.wait()  # nobody writes before all have read
+    _unflatten(mean, network)
+
+
+def _flat(network: Eyes) -> Tensor:
+    """All weights and running means as one vector."""
+    return torch.cat([v.detach().flatten() for v in network.state_dict().values() if v.dtype.is_floating_point])
+
+
+@torch.no_grad()
+def _unflatten(flat: Tensor, network: Eyes) -> None:
+    start = 0
+    for value in network.state_dict().values():
+        if value.dtype.is_floating_point:
+            value.copy_(flat[start : start + value.numel()].view(value.shape))
+            start += value.numel()
+
+
+def _pool(params: TrainingParams, worker: int) -> Pool:
+    return Pool(FrameSource(seed=params.seed, variants=params.variants), params.pool_chunks, worker, params.workers)
+
+
+def train_step(state: State, pool: Pool, params: TrainingParams, done: float, worker: int = 0) -> dict[str, float]:
+    """One step; which frames, augmentations and dropout it uses follows from seed, step and worker alone."""
+    rng = np.random.default_rng([params.seed, 17, state.step, worker])
     generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
     pairs = pool.at(params.pool_chunks - 1 + state.step // params.steps_per_chunk)
     chosen = [pairs[i] for i in rng.choice(len(pairs), min(params.pairs, len(pairs)), replace=False)]
@@ -187,7 +345,7 @@ def train_step(state: State, pool: Pool, params: TrainingParams, done: float) ->
     nn.utils.clip_grad_norm_(state.network.parameters(), 10.0)
     state.optimiser.step()
     state.step += 1
-    state.images += len(batch.images)
+    state.images += len(batch.images) * params.workers
     _average(state.averaged, state.network, min(params.average, (1 + state.step) / (10 + state.step)))
     return {name: float(value.detach()) for name, value in parts.items()}
 

@@ -237,3 +237,14 @@ def test_bad_parameters_are_refused(change):
 def test_bad_networks_are_refused(change):
     with pytest.raises(ValueError, match=next(iter(change))):
         NetworkParams(**({"classes": ("a",)} | change))
+
+
+def test_two_workers_average_their_weights(tmp_path):
+    rows = []
+    params = quick(steps=2, workers=2, meet_every=2)
+    state = train(params, tmp_path, network=tiny(), report=rows.append, report_s=0)
+    assert state.step == 2
+    assert state.images == rows[-1]["images"] == 8
+    alone = train(quick(steps=2), tmp_path / "alone", network=tiny())
+    pairs = zip(state.network.parameters(), alone.network.parameters(), strict=True)
+    assert any((a != b).any() for a, b in pairs)
