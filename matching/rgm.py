@@ -11,8 +11,9 @@ Where the text does not determine a method that works, this file chooses, and sa
   ways seen from above (needs `up` in both graphs).
 * Terms of Eq. (15) grow like m, m^2 and m^3; `scaling="mean"` gives all of them the size of the count penalty, and
   ||X||^2 is m^2 (`count_penalty`): see `covis.matching.objective.coefficients`. `scaling="sum"` is as printed.
-* (V + U) adds m^2 to squared probabilities: each is divided by its own unit, by default twice its median in the pair,
-  so that V + U is 1 for a typical candidate and lambda_1 weighs a relative uncertainty. Units of 1 are as printed.
+* (V + U) adds m^2 to squared probabilities: each is divided by its own unit, by default six medians in the pair,
+  so that lambda_1 weighs a relative uncertainty: 0.1 costs a typical candidate .01, one of five times the variances
+  .28. Units of 1 are as printed.
 * gamma and sigma stand for seven different widths; each is a parameter here, with its unit.
 * exp() of Eq. (16) overflows: the chain works with log P.
 * Eq. (18) is normalised over the objects that can be added.
@@ -55,6 +56,9 @@ from .uncertainty import certainty, kronecker_plus, typical
 MAX_OBJECTS = 64
 """Largest n or n' accepted: finding the nearest triangles takes O(n^6) operations, the pair affinity O(n^4) memory."""
 
+UNIT_MEDIANS = 6.0
+"""Unit of V and of U in the uncertainty regulariser, in medians over the candidates."""
+
 ACCEPTANCES = ("paper", "metropolis")
 
 
@@ -66,9 +70,10 @@ class Similarity:
         distance_width_m2: gamma of Eq. (2), m^2. None: `distance_width_factor` times the median of U.
         distance_width_factor: see above.
         angle_width: gamma of Eq. (3), dimensionless (a sum of differences of cosines).
-        attribute_uncertainty_width: sigma of Eq. (8), probability^2. None: 20 times the median of V.
-        distance_uncertainty_width_m2: sigma of Eq. (10), m^2. None: 20 times the median of U.
-        angle_uncertainty_width_m2: sigma of Eq. (11), m^2. None: 20 times the median of U.
+        attribute_uncertainty_width: sigma of Eq. (8), probability^2. None: `uncertainty_width_factor` medians of V.
+        distance_uncertainty_width_m2: sigma of Eq. (10), m^2. None: `uncertainty_width_factor` medians of U.
+        angle_uncertainty_width_m2: sigma of Eq. (11), m^2. None: `uncertainty_width_factor` medians of U.
+        uncertainty_width_factor: see above.
         neighbours: k of section 3.4, nearest target triangles of each source triangle. None: n n'.
         nine_terms: Eq. (3) as printed.
         reject_mirrored: T = 0 for triangles that turn opposite ways seen from above.
@@ -80,6 +85,7 @@ class Similarity:
     attribute_uncertainty_width: float | None = None
     distance_uncertainty_width_m2: float | None = None
     angle_uncertainty_width_m2: float | None = None
+    uncertainty_width_factor: float = 60.0
     neighbours: int | None = None
     nine_terms: bool = False
     reject_mirrored: bool = False
@@ -98,7 +104,7 @@ class Annealing:
     """
 
     proposals: int | None = None
-    start_temperature: float = 10.0
+    start_temperature: float = 3.0
     end_temperature: float = 0.1
     acceptance: str = "paper"
     add_probability: float = 0.5
@@ -152,7 +158,7 @@ def rgm(
     noncovisibility_weight: float = 0.4,
     acceptance: str = "paper",
     proposals: int | None = None,
-    start_temperature: float = 10.0,
+    start_temperature: float = 3.0,
     end_temperature: float = 0.1,
     add_probability: float = 0.5,
     proposal_width: float = 2.0,
@@ -164,6 +170,7 @@ def rgm(
     attribute_uncertainty_width: float | None = None,
     distance_uncertainty_width_m2: float | None = None,
     angle_uncertainty_width_m2: float | None = None,
+    uncertainty_width_factor: float = 60.0,
     attribute_unit: float | None = None,
     position_unit_m2: float | None = None,
     neighbours: int | None = None,
@@ -182,10 +189,10 @@ def rgm(
         acceptance, proposals, start_temperature, end_temperature, add_probability, proposal_width: see `Annealing`.
         scaling, count_penalty: see `covis.matching.objective.coefficients`.
         distance_width_m2, distance_width_factor, angle_width, attribute_uncertainty_width,
-            distance_uncertainty_width_m2, angle_uncertainty_width_m2, neighbours, nine_terms, reject_mirrored: see
-            `Similarity`.
-        attribute_unit: unit of v in the uncertainty regulariser, probability^2. None: twice the median of V.
-        position_unit_m2: unit of u there, m^2. None: twice the median of U. Give 1 for both to follow the text.
+            distance_uncertainty_width_m2, angle_uncertainty_width_m2, uncertainty_width_factor, neighbours, nine_terms,
+            reject_mirrored: see `Similarity`.
+        attribute_unit: unit of v in the uncertainty regulariser, probability^2. None: `UNIT_MEDIANS` medians of V.
+        position_unit_m2: unit of u there, m^2. None: `UNIT_MEDIANS` medians of U. Give 1 for both to follow the text.
         workers: processes among which the proposals are divided (section 4.2).
 
     Returns:
@@ -203,6 +210,7 @@ def rgm(
         attribute_uncertainty_width,
         distance_uncertainty_width_m2,
         angle_uncertainty_width_m2,
+        uncertainty_width_factor,
         neighbours,
         nine_terms,
         reject_mirrored,
@@ -264,14 +272,23 @@ def build(
     for name, number in (("distance_width_m2", width), ("angle_width", similarity.angle_width)):
         if not number > 0:
             raise ValueError(f"{name} must be positive, got {number}")
-    w_a = certainty(V, _or(similarity.attribute_uncertainty_width, 20 * scale_V))  # Eq. (8)
-    w_d = certainty(U, _or(similarity.distance_uncertainty_width_m2, 20 * scale_U))  # Eq. (10)
-    w_t = certainty(U, _or(similarity.angle_uncertainty_width_m2, 20 * scale_U))  # Eq. (11)
+    w_a = certainty(
+        V, _or(similarity.attribute_uncertainty_width, similarity.uncertainty_width_factor * scale_V)
+    )  # Eq. (8)
+    w_d = certainty(
+        U, _or(similarity.distance_uncertainty_width_m2, similarity.uncertainty_width_factor * scale_U)
+    )  # Eq. (10)
+    w_t = certainty(
+        U, _or(similarity.angle_uncertainty_width_m2, similarity.uncertainty_width_factor * scale_U)
+    )  # Eq. (11)
     c, d = vertex_cosines(source.positions), vertex_cosines(target.positions)
     neighbours = len(source) * len(target) if similarity.neighbours is None else similarity.neighbours
     if neighbours < 1:
         raise ValueError(f"neighbours must be at least 1, got {neighbours}")
-    attribute_unit, position_unit_m2 = _or(attribute_unit, 2 * scale_V), _or(position_unit_m2, 2 * scale_U)
+    attribute_unit, position_unit_m2 = (
+        _or(attribute_unit, UNIT_MEDIANS * scale_V),
+        _or(position_unit_m2, UNIT_MEDIANS * scale_U),
+    )
     pair = pair_affinity(source_distance, target_distance, width)
     pair *= w_d[:, :, None, None]
     pair *= w_d[None, None]
