@@ -168,11 +168,11 @@ EFFECTS = EffectRanges()
 def vary(images: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
     """Images (b, H, W, 3) as other cameras would take them: exposure, colour, contrast, blur, vignette, noise.
 
-    One in three stays as it was rendered.
+    Half of them stay as they were rendered.
     """
     out = images.copy()
     for picture in out:
-        if rng.random() < 2 / 3:
+        if rng.random() < 0.5:
             expose(picture, EFFECTS.sample(rng), rng, out=picture)
     return out
 

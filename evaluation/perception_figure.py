@@ -1,0 +1,77 @@
+"""Pictures in the manner of the paper's Fig. 4 and 5: what the eyes saw, and how unsure they are of it, per object."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..matching.pose import Array
+
+if TYPE_CHECKING:
+    from ..agents.perception.detections import Detections
+
+Picture = NDArray[np.uint8]
+TITLES = (
+    "image",
+    "masks",
+    "depth of the centre, m",
+    "v: attribute uncertainty",
+    "u: position uncertainty, m (1 sigma)",
+)
+GREY = 0.35
+BAND = 22
+"""Height of the titles, px."""
+
+
+def figure(image: Picture, found: Detections) -> Picture:
+    """Five panels side by side (H + BAND, 5 W, 3): image, masks, depth, v and the square root of u.
+
+    Args:
+        image: (H, W, 3) RGB.
+        found: detections in it, with masks.
+
+    Raises:
+        ValueError: detections without masks.
+    """
+    if found.masks is None:
+        raise ValueError("a figure needs detections with masks")
+    graph = found.graph
+    faded = (GREY * image.mean(axis=2, keepdims=True)).repeat(3, axis=2)
+    values = (graph.positions[:, 2], graph.attribute_variance, np.sqrt(graph.position_variance))
+    panels = [image.copy(), _outlined(image, found.masks)]
+    panels += [_painted(faded, found, value) for value in values]
+    return np.concatenate([_titled(p, title) for p, title in zip(panels, TITLES, strict=True)], axis=1)
+
+
+def _outlined(image: Picture, masks: NDArray[np.bool_]) -> Picture:
+    out = image.copy()
+    for i, mask in enumerate(masks):
+        hue = np.array([[[int(i * 67) % 180, 220, 255]]], np.uint8)
+        color = cv2.cvtColor(hue, cv2.COLOR_HSV2RGB)[0, 0].astype(np.float64)
+        out[mask] = (0.5 * out[mask] + 0.5 * color).astype(np.uint8)
+        edge = mask & ~cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+        out[edge] = color.astype(np.uint8)
+    return out
+
+
+def _painted(background: Array, found: Detections, values: Array) -> Picture:
+    """Each mask in the colour of its value, from the least (dark) to the greatest (bright), with its number."""
+    assert found.masks is not None
+    out = background.astype(np.uint8)
+    span = np.ptp(values) if len(values) else 0.0
+    for mask, box, value in zip(found.masks, found.boxes, values, strict=True):
+        share = (value - values.min()) / span if span > 0 else 0.5
+        level = np.array([[round(255 * float(share))]], np.uint8)
+        out[mask] = cv2.cvtColor(cv2.applyColorMap(level, cv2.COLORMAP_VIRIDIS), cv2.COLOR_BGR2RGB)[0, 0]
+        at = int(box[0]), int(max(box[1] - 2, 8))
+        cv2.putText(out, f"{value:.2g}", at, cv2.FONT_HERSHEY_SIMPLEX, 0.33, (255, 255, 255), 1, cv2.LINE_AA)
+    return out
+
+
+def _titled(panel: Picture, title: str) -> Picture:
+    band = np.full((BAND, panel.shape[1], 3), 255, np.uint8)
+    cv2.putText(band, title, (4, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 0, 0), 1, cv2.LINE_AA)
+    return np.concatenate([band, panel])
