@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from highway_env.vehicle.objects import Obstacle
 from numba import njit
 from numpy.typing import NDArray
 
@@ -24,7 +23,8 @@ from .lighting import sample_light
 from .road_surface import road_surface
 from .street import Catalogue, Street
 from .street_meshes import barrier, building, bus, car, person, sign, signal, tree, truck, van
-from .traffic import ConnectedVehicle, FastNetwork, FastRoad, TrafficVehicle, corners, make_road, rectangles_intersect
+from .traffic import ConnectedVehicle, FastNetwork, FastRoad, Obstacle, TrafficVehicle, make_road
+from .traffic_kernels import corners, rectangles_intersect
 from .world import Array, Light, Mesh, SceneGenerationError, Snapshot
 
 SIMULATION_HZ = 15

@@ -10,7 +10,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from .driving_maps import RoadMap
-from .traffic import L_LENGTH, L_WIDTH, LaneTable, projected
+from .traffic import LaneTable
+from .traffic_kernels import L_LENGTH, L_WIDTH, projected
 
 Array = NDArray[np.float64]
 

@@ -17,10 +17,53 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from .driving_maps import RoadMap  # first: it silences pygame before highway-env imports it
+from .traffic_kernels import (
+    CIRCULAR,
+    L_AMPLITUDE,
+    L_DX,
+    L_DY,
+    L_HEADING,
+    L_KIND,
+    L_LENGTH,
+    L_PHASE,
+    L_PULSATION,
+    L_RADIUS,
+    L_SPEED_LIMIT,
+    L_START_PHASE,
+    L_TURN,
+    L_WIDTH,
+    L_X,
+    L_Y,
+    LANE_COLUMNS,
+    LOOK_AHEAD_S,
+    SINE,
+    V_ACCELERATION,
+    V_COS,
+    V_HEADING,
+    V_IMPACTED,
+    V_LENGTH,
+    V_SIN,
+    V_SPEED,
+    V_STEERING,
+    V_TARGET,
+    V_WIDTH,
+    V_X,
+    V_Y,
+    VEHICLE_COLUMNS,
+    closest_lane,
+    closest_lanes,
+    collisions,
+    idm_commands,
+    move,
+    neighbours,
+    past_end,
+    predicted_conflicts,
+    situations,
+    translation,
+)
 
 # isort: split
 from highway_env.road.lane import AbstractLane, CircularLane, SineLane, StraightLane
@@ -33,22 +76,6 @@ from highway_env.vehicle.objects import Landmark, Obstacle
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 LaneIndex = tuple[str, str, int]
-
-STRAIGHT, SINE, CIRCULAR = 0, 1, 2
-# Columns of the lane table.
-L_KIND, L_X, L_Y, L_DX, L_DY, L_LENGTH, L_WIDTH, L_HEADING, L_AMPLITUDE, L_PULSATION, L_PHASE = range(11)
-L_RADIUS, L_START_PHASE, L_TURN, L_SPEED_LIMIT, LANE_COLUMNS = range(11, 16)
-# Columns of the vehicle table.
-V_X, V_Y, V_HEADING, V_SPEED, V_LANE, V_TARGET, V_TARGET_SPEED, V_DELTA, V_LENGTH, V_WIDTH = range(10)
-V_ACC_MAX, V_COMFORT_MAX, V_COMFORT_MIN, V_DISTANCE, V_TIME, V_CRASHED, V_STEERING, V_ACCELERATION = range(10, 18)
-V_IMPACT_X, V_IMPACT_Y, V_IMPACTED, V_COS, V_SIN, VEHICLE_COLUMNS = range(18, 24)
-# Columns of the situation table: what an IDM driver needs to know.
-S_WANTED, S_GAP, S_TARGET_GAP, S_LATERAL, S_HEADING, S_SLOPE, SITUATION_COLUMNS = range(7)
-
-LOOK_AHEAD_S = np.arange(0.25, 3, 0.25)  # RegulatedRoad.is_conflict_possible: horizon 3 s, step 0.25 s
-MAX_STEERING_RAD = IDMVehicle.MAX_STEERING_ANGLE
-VEHICLE_END_M = AbstractLane.VEHICLE_LENGTH
-PURSUIT_S = IDMVehicle.TAU_PURSUIT
 
 
 class TrafficVehicle(IDMVehicle):
@@ -381,427 +408,6 @@ def route_table(vehicles: list[TrafficVehicle], lanes: LaneTable) -> Ints:
     for row, route in zip(table, routes, strict=True):
         row[: len(route)] = route
     return table
-
-
-# --- lane geometry -------------------------------------------------------------------------------------------------
-
-
-@njit(cache=True)
-def wrap_to_pi(x: float) -> float:
-    """highway_env.utils.wrap_to_pi."""
-    return ((x + math.pi) % (2 * math.pi)) - math.pi
-
-
-@njit(cache=True)
-def not_zero(x: float) -> float:
-    """highway_env.utils.not_zero."""
-    if abs(x) > 1e-2:
-        return x
-    return 1e-2 if x >= 0 else -1e-2
-
-
-@njit(cache=True)
-def local_coordinates(lane: Array, x: float, y: float, angle: float) -> tuple[float, float]:
-    """(longitudinal, lateral) m of a point on a lane: `AbstractLane.local_coordinates`.
-
-    `angle` is the point's direction (rad) from the lane's centre, used by circular lanes only.
-    """
-    dx, dy = x - lane[L_X], y - lane[L_Y]
-    if lane[L_KIND] == CIRCULAR:
-        phi = lane[L_START_PHASE] + wrap_to_pi(angle - lane[L_START_PHASE])
-        longitudinal = lane[L_TURN] * (phi - lane[L_START_PHASE]) * lane[L_RADIUS]
-        return longitudinal, lane[L_TURN] * (lane[L_RADIUS] - math.sqrt(dx * dx + dy * dy))
-    longitudinal = dx * lane[L_DX] + dy * lane[L_DY]
-    lateral = dy * lane[L_DX] - dx * lane[L_DY]
-    if lane[L_KIND] == SINE:
-        lateral -= lane[L_AMPLITUDE] * math.sin(lane[L_PULSATION] * longitudinal + lane[L_PHASE])
-    return longitudinal, lateral
-
-
-@njit(cache=True)
-def projected(lane: Array, x: float, y: float) -> tuple[float, float]:
-    """`local_coordinates` with the compiler's own arctangent: right to the last bit or two."""
-    angle = math.atan2(y - lane[L_Y], x - lane[L_X]) if lane[L_KIND] == CIRCULAR else 0.0
-    return local_coordinates(lane, x, y, angle)
-
-
-@njit(cache=True)
-def slope_at(lane: Array, longitudinal: float) -> float:
-    """Tangent of a sine lane's deviation from its axis."""
-    return lane[L_AMPLITUDE] * lane[L_PULSATION] * math.cos(lane[L_PULSATION] * longitudinal + lane[L_PHASE])
-
-
-@njit(cache=True)
-def heading_at(lane: Array, longitudinal: float) -> float:
-    """Heading (rad) of a lane: `AbstractLane.heading_at`."""
-    if lane[L_KIND] == CIRCULAR:
-        phi = lane[L_TURN] * longitudinal / lane[L_RADIUS] + lane[L_START_PHASE]
-        return phi + math.pi / 2 * lane[L_TURN]
-    if lane[L_KIND] == SINE:
-        return lane[L_HEADING] + math.atan(slope_at(lane, longitudinal))
-    return lane[L_HEADING]
-
-
-@njit(cache=True)
-def position_at(lane: Array, longitudinal: float) -> tuple[float, float]:
-    """Point (m) of a lane's centre line: `AbstractLane.position(longitudinal, 0)`."""
-    if lane[L_KIND] == CIRCULAR:
-        phi = lane[L_TURN] * longitudinal / lane[L_RADIUS] + lane[L_START_PHASE]
-        return lane[L_X] + lane[L_RADIUS] * math.cos(phi), lane[L_Y] + lane[L_RADIUS] * math.sin(phi)
-    lateral = 0.0
-    if lane[L_KIND] == SINE:
-        lateral = lane[L_AMPLITUDE] * math.sin(lane[L_PULSATION] * longitudinal + lane[L_PHASE])
-    x = lane[L_X] + longitudinal * lane[L_DX] - lateral * lane[L_DY]
-    y = lane[L_Y] + longitudinal * lane[L_DY] + lateral * lane[L_DX]
-    return x, y
-
-
-@njit(cache=True)
-def closest_lane(lanes: Array, x: float, y: float, heading: float) -> int:
-    """Row of the closest lane in position and heading (nan: position alone): `RoadNetwork.get_closest_lane_index`."""
-    best, best_distance = 0, np.inf
-    for row in range(len(lanes)):
-        lane = lanes[row]
-        s, lateral = projected(lane, x, y)
-        distance = abs(lateral) + max(s - lane[L_LENGTH], 0.0) + max(0.0 - s, 0.0)
-        if not math.isnan(heading):
-            if distance >= best_distance:
-                continue
-            distance += abs(wrap_to_pi(heading - heading_at(lane, s)))
-        if distance < best_distance:
-            best, best_distance = row, distance
-    return best
-
-
-@njit(cache=True)
-def closest_lanes(lanes: Array, vehicles: Array) -> Ints:
-    """Row (n,) of each vehicle's closest lane."""
-    rows = np.zeros(len(vehicles), dtype=np.int64)
-    for k in range(len(vehicles)):
-        rows[k] = closest_lane(lanes, vehicles[k, V_X], vehicles[k, V_Y], vehicles[k, V_HEADING])
-    return rows
-
-
-@njit(cache=True)
-def past_end(lanes: Array, vehicles: Array, angles: Array) -> NDArray[np.bool_]:
-    """(n,) whether each vehicle has passed the end of its target lane: `AbstractLane.after_end`."""
-    ended = np.zeros(len(vehicles), dtype=np.bool_)
-    for k in range(len(vehicles)):
-        row = int(vehicles[k, V_TARGET])
-        s, _ = local_coordinates(lanes[row], vehicles[k, V_X], vehicles[k, V_Y], angles[k, row])
-        ended[k] = s > lanes[row, L_LENGTH] - VEHICLE_END_M / 2
-    return ended
-
-
-# --- drivers -------------------------------------------------------------------------------------------------------
-
-
-@njit(cache=True)
-def neighbours(
-    lanes: Array, connected: Ints, offsets: Array, row: int, me: int, bodies: Array, angles: Array
-) -> tuple[int, int]:
-    """Indices of the bodies ahead of and behind `me` on lane `row`, -1: none. `Road.neighbour_vehicles`."""
-    s, _ = local_coordinates(lanes[row], bodies[me, V_X], bodies[me, V_Y], angles[me, row])
-    front, rear, s_front, s_rear = -1, -1, np.inf, -np.inf
-    for k in range(len(bodies)):
-        if k == me:
-            continue
-        for c in range(connected.shape[1]):
-            other = connected[row, c]
-            if other < 0:
-                break
-            s_k, lateral = local_coordinates(lanes[other], bodies[k, V_X], bodies[k, V_Y], angles[k, other])
-            inside = -VEHICLE_END_M <= s_k < lanes[other, L_LENGTH] + VEHICLE_END_M
-            if not (inside and abs(lateral) <= lanes[other, L_WIDTH] / 2 + 1):
-                continue
-            s_k += offsets[row, c]
-            if s <= s_k and s_k <= s_front:
-                front, s_front = k, s_k
-            if s_k < s and s_k > s_rear:
-                rear, s_rear = k, s_k
-            break
-    return front, rear
-
-
-@njit(cache=True)
-def relative_gap(lanes: Array, bodies: Array, me: int, front: int, angles: Array) -> float:
-    """Desired gap to the one ahead over the real one: `IDMVehicle.desired_gap` / `lane_distance_to`."""
-    ego, other = bodies[me], bodies[front]
-    row = int(ego[V_LANE])
-    ahead, _ = local_coordinates(lanes[row], other[V_X], other[V_Y], angles[front, row])
-    here, _ = local_coordinates(lanes[row], ego[V_X], ego[V_Y], angles[me, row])
-    dvx = ego[V_SPEED] * ego[V_COS] - other[V_SPEED] * other[V_COS]
-    dvy = ego[V_SPEED] * ego[V_SIN] - other[V_SPEED] * other[V_SIN]
-    closing = dvx * ego[V_COS] + dvy * ego[V_SIN]
-    ab = -ego[V_COMFORT_MAX] * ego[V_COMFORT_MIN]
-    gap = ego[V_DISTANCE] + ego[V_SPEED] * ego[V_TIME] + ego[V_SPEED] * closing / (2 * math.sqrt(ab))
-    return gap / not_zero(ahead - here)
-
-
-@njit(cache=True)
-def situations(lanes: Array, connected: Ints, offsets: Array, bodies: Array, n: int, angles: Array) -> Array:
-    """What each of the first n bodies sees, (n, SITUATION_COLUMNS).
-
-    Wanted speed, relative gaps on the own and the target lane (0: nobody ahead), offset from the target lane's centre,
-    and its heading and slope a moment ahead.
-    """
-    out = np.zeros((n, SITUATION_COLUMNS))
-    for k in range(n):
-        v = bodies[k]
-        own, target = int(v[V_LANE]), int(v[V_TARGET])
-        limit, wanted = lanes[own, L_SPEED_LIMIT], v[V_TARGET_SPEED]
-        out[k, S_WANTED] = wanted if math.isnan(limit) else min(max(wanted, 0.0), limit)
-        front, _ = neighbours(lanes, connected, offsets, own, k, bodies, angles)
-        if front >= 0:
-            out[k, S_GAP] = relative_gap(lanes, bodies, k, front, angles)
-        out[k, S_TARGET_GAP] = out[k, S_GAP]
-        if own != target:
-            front, _ = neighbours(lanes, connected, offsets, target, k, bodies, angles)
-            out[k, S_TARGET_GAP] = relative_gap(lanes, bodies, k, front, angles) if front >= 0 else 0.0
-        s, lateral = local_coordinates(lanes[target], v[V_X], v[V_Y], angles[k, target])
-        ahead = s + v[V_SPEED] * PURSUIT_S
-        out[k, S_LATERAL] = lateral
-        if lanes[target, L_KIND] == SINE:
-            out[k, S_HEADING], out[k, S_SLOPE] = lanes[target, L_HEADING], slope_at(lanes[target], ahead)
-        else:
-            out[k, S_HEADING] = heading_at(lanes[target], ahead)
-    return out
-
-
-def idm_commands(vehicles: Array, seen: Array) -> tuple[Array, Array]:
-    """Acceleration (n,) m/s^2 and steering (n,) rad.
-
-    `IDMVehicle.acceleration` and `ControlledVehicle.steering_control`.
-    """
-    speed, comfort = vehicles[:, V_SPEED], vehicles[:, V_COMFORT_MAX]
-    ratio = np.maximum(speed, 0) / np.abs(not_zeros(seen[:, S_WANTED]))
-    free = comfort * (1 - np.power(ratio, vehicles[:, V_DELTA]))
-    acceleration = np.minimum(
-        free - comfort * np.power(seen[:, S_GAP], 2), free - comfort * np.power(seen[:, S_TARGET_GAP], 2)
-    )
-    moving = not_zeros(speed)
-    lateral_speed = -IDMVehicle.KP_LATERAL * seen[:, S_LATERAL]
-    heading_command = np.arcsin(_clip(lateral_speed / moving, 1.0))
-    reference = seen[:, S_HEADING] + np.arctan(seen[:, S_SLOPE]) + _clip(heading_command, np.pi / 4)
-    rate = IDMVehicle.KP_HEADING * (((reference - vehicles[:, V_HEADING] + np.pi) % (2 * np.pi)) - np.pi)
-    slip = np.arcsin(_clip(vehicles[:, V_LENGTH] / 2 / moving * rate, 1.0))
-    steering = _clip(np.arctan(2 * np.tan(slip)), MAX_STEERING_RAD)
-    return _clip(acceleration, vehicles[:, V_ACC_MAX]), steering
-
-
-def not_zeros(x: Array) -> Array:
-    """`highway_env.utils.not_zero` of each element."""
-    return np.where(np.abs(x) > 1e-2, x, np.where(x >= 0, 1e-2, -1e-2))
-
-
-def _clip(x: Array, bound: Any) -> Array:
-    return np.minimum(np.maximum(x, -bound), bound)
-
-
-# --- motion --------------------------------------------------------------------------------------------------------
-
-
-def move(vehicles: Array, dt: float) -> None:
-    """Advance the table by `dt` s in place: `Vehicle.step`, a bicycle model."""
-    crashed, speed = vehicles[:, V_CRASHED] > 0, vehicles[:, V_SPEED].copy()
-    steering = np.where(crashed, 0.0, vehicles[:, V_STEERING])
-    acceleration = np.where(crashed, -1.0 * speed, vehicles[:, V_ACCELERATION])
-    top, bottom = Vehicle.MAX_SPEED, Vehicle.MIN_SPEED
-    acceleration = np.where(speed > top, np.minimum(acceleration, top - speed), acceleration)
-    acceleration = np.where(speed < bottom, np.maximum(acceleration, bottom - speed), acceleration)
-    beta = np.arctan(0.5 * np.tan(steering))
-    course = vehicles[:, V_HEADING] + beta
-    vehicles[:, V_X] += speed * np.cos(course) * dt
-    vehicles[:, V_Y] += speed * np.sin(course) * dt
-    vehicles[:, V_X] += vehicles[:, V_IMPACT_X]
-    vehicles[:, V_Y] += vehicles[:, V_IMPACT_Y]
-    vehicles[:, V_HEADING] += speed * np.sin(beta) / (vehicles[:, V_LENGTH] / 2) * dt
-    vehicles[:, V_SPEED] += acceleration * dt
-    vehicles[:, V_STEERING], vehicles[:, V_ACCELERATION] = steering, acceleration
-
-
-# --- collisions ----------------------------------------------------------------------------------------------------
-
-
-@njit(cache=True)
-def corners(x: float, y: float, heading: float, length: float, width: float) -> Array:
-    """(4, 2) m corners of a rectangle in order around it: `RoadObject.polygon` without its closing point."""
-    c, s = math.cos(heading), math.sin(heading)
-    out = np.empty((4, 2))
-    for k in range(4):
-        dx = -length / 2 if k < 2 else length / 2
-        dy = width / 2 if k == 1 or k == 2 else -width / 2
-        out[k, 0] = x + c * dx - s * dy
-        out[k, 1] = y + s * dx + c * dy
-    return out
-
-
-@njit(cache=True)
-def rectangles_intersect(a: Array, b: Array, ax: float, ay: float, bx: float, by: float) -> tuple[bool, bool]:
-    """Whether two rectangles (4, 2) intersect now, and after moving by (ax, ay) and (bx, by).
-
-    The yes or no of `utils.are_polygons_intersecting`.
-    """
-    intersecting, will_intersect = True, True
-    for polygon in (a, b):
-        for k in range(4):
-            nx = -(polygon[(k + 1) % 4, 1] - polygon[k, 1])
-            ny = polygon[(k + 1) % 4, 0] - polygon[k, 0]
-            norm = math.sqrt(nx * nx + ny * ny)
-            nx, ny = nx / norm, ny / norm
-            a_projected, b_projected = a[:, 0] * nx + a[:, 1] * ny, b[:, 0] * nx + b[:, 1] * ny
-            min_a, max_a = a_projected.min(), a_projected.max()
-            min_b, max_b = b_projected.min(), b_projected.max()
-            if (min_b - max_a if min_a < min_b else min_a - max_b) > 0:
-                intersecting = False
-            moved = nx * (ax - bx) + ny * (ay - by)
-            if moved < 0:
-                min_a += moved
-            else:
-                max_a += moved
-            if (min_b - max_a if min_a < min_b else min_a - max_b) > 0:
-                will_intersect = False
-            if not intersecting and not will_intersect:
-                return False, False
-    return intersecting, will_intersect
-
-
-@njit(cache=True)
-def translation(a: Array, b: Array, moved_a: Array, moved_b: Array) -> Array:
-    """(2,) m by which highway-env moves colliding rectangles apart; a, b (5, 2) are its closed polygons.
-
-    The translation of `utils.are_polygons_intersecting`.
-    """
-    shortest, axis = np.inf, np.zeros(2)
-    toward_x, toward_y = a[:4, 0].mean() - b[:4, 0].mean(), a[:4, 1].mean() - b[:4, 1].mean()
-    for polygon in (a, b):
-        for k in range(4):
-            nx, ny = -polygon[k + 1, 1] + polygon[k, 1], polygon[k + 1, 0] - polygon[k, 0]
-            norm = math.sqrt(nx * nx + ny * ny)
-            nx, ny = nx / norm, ny / norm
-            a_projected, b_projected = a[:, 0] * nx + a[:, 1] * ny, b[:, 0] * nx + b[:, 1] * ny
-            min_a, max_a = a_projected.min(), a_projected.max()
-            min_b, max_b = b_projected.min(), b_projected.max()
-            moved = nx * (moved_a[0] - moved_b[0]) + ny * (moved_a[1] - moved_b[1])
-            if moved < 0:
-                min_a += moved
-            else:
-                max_a += moved
-            distance = min_b - max_a if min_a < min_b else min_a - max_b
-            if abs(distance) < shortest:
-                shortest = abs(distance)
-                sign = 1.0 if toward_x * nx + toward_y * ny > 0 else -1.0
-                axis[0], axis[1] = sign * nx, sign * ny
-    return shortest * axis
-
-
-@njit(cache=True)
-def diagonal(body: Array) -> float:
-    """Length (m) of a body's diagonal."""
-    return math.sqrt(body[V_LENGTH] ** 2 + body[V_WIDTH] ** 2)
-
-
-@njit(cache=True)
-def outline(body: Array) -> Array:
-    """(4, 2) m corners of a body."""
-    return corners(body[V_X], body[V_Y], body[V_HEADING], body[V_LENGTH], body[V_WIDTH])
-
-
-@njit(cache=True)
-def collisions(bodies: Array, n: int, dt: float) -> Ints:
-    """Pairs of bodies, the first of them one of the first n, that touch or will within `dt` s.
-
-    Rows [i, j, intersecting, will intersect], in the order of `Road.step`: for every vehicle the
-    later vehicles, then all obstacles.
-    """
-    found = [(0, 0, 0, 0)]
-    for i in range(n):
-        a = bodies[i]
-        for j in range(i + 1, len(bodies)):
-            b = bodies[j]
-            reach = (diagonal(a) + diagonal(b)) / 2 + a[V_SPEED] * dt
-            if math.sqrt((b[V_X] - a[V_X]) ** 2 + (b[V_Y] - a[V_Y]) ** 2) > reach:
-                continue
-            hits, will_hit = rectangles_intersect(
-                outline(a),
-                outline(b),
-                a[V_SPEED] * a[V_COS] * dt,
-                a[V_SPEED] * a[V_SIN] * dt,
-                b[V_SPEED] * b[V_COS] * dt,
-                b[V_SPEED] * b[V_SIN] * dt,
-            )
-            if hits or will_hit:
-                found.append((i, j, 1 if hits else 0, 1 if will_hit else 0))
-    out = np.empty((len(found) - 1, 4), dtype=np.int64)
-    for k in range(1, len(found)):
-        out[k - 1, 0], out[k - 1, 1], out[k - 1, 2], out[k - 1, 3] = found[k]
-    return out
-
-
-# --- right of way --------------------------------------------------------------------------------------------------
-
-
-@njit(cache=True)
-def predicted_path(lanes: Array, vehicle: Array, route: Ints, times: Array) -> Array:
-    """(t, 3) x, y, heading along the route at constant speed: `predict_trajectory_constant_speed`."""
-    s, _ = projected(lanes[int(vehicle[V_LANE])], vehicle[V_X], vehicle[V_Y])
-    path = np.empty((len(times), 3))
-    for k in range(len(times)):
-        longitudinal = s + vehicle[V_SPEED] * times[k]
-        r = 0
-        while r + 1 < len(route) and route[r + 1] >= 0 and longitudinal > lanes[route[r], L_LENGTH]:
-            longitudinal -= lanes[route[r], L_LENGTH]
-            r += 1
-        path[k, 0], path[k, 1] = position_at(lanes[route[r]], longitudinal)
-        path[k, 2] = heading_at(lanes[route[r]], longitudinal)
-    return path
-
-
-@njit(cache=True)
-def covers_corner(
-    x1: float, y1: float, h1: float, l1: float, w1: float, x2: float, y2: float, h2: float, l2: float, w2: float
-) -> bool:
-    """Whether rectangle 2 holds a corner, an edge's midpoint or the centre of rectangle 1: `has_corner_inside`.
-
-    highway-env turns the point by +heading, where -heading would be right; its traffic depends on it, so it stays.
-    """
-    c1, s1, c2, s2 = math.cos(h1), math.sin(h1), math.cos(h2), math.sin(h2)
-    for i in (-1, 0, 1):
-        for j in (-1, 0, 1):
-            px, py = i * l1 / 2, j * w1 / 2
-            dx = c1 * px - s1 * py + x1 - x2
-            dy = s1 * px + c1 * py + y1 - y2
-            u, v = c2 * dx - s2 * dy, s2 * dx + c2 * dy
-            if -l2 / 2 <= u <= l2 / 2 and -w2 / 2 <= v <= w2 / 2:
-                return True
-    return False
-
-
-@njit(cache=True)
-def predicted_conflicts(lanes: Array, vehicles: Array, routes: Ints, times: Array) -> Ints:
-    """Pairs (c, 2) of vehicles whose predicted paths conflict: `RegulatedRoad.is_conflict_possible` over all pairs."""
-    n = len(vehicles)
-    paths = np.empty((n, len(times), 3))
-    for k in range(n):
-        paths[k] = predicted_path(lanes, vehicles[k], routes[k], times)
-    found = []
-    for i in range(n - 1):
-        for j in range(i + 1, n):
-            for t in range(len(times)):
-                p, q = paths[i, t], paths[j, t]
-                if math.sqrt((q[0] - p[0]) ** 2 + (q[1] - p[1]) ** 2) > vehicles[i, V_LENGTH]:
-                    continue
-                l1, w1 = 1.5 * vehicles[i, V_LENGTH], 0.9 * vehicles[i, V_WIDTH]
-                l2, w2 = 1.5 * vehicles[j, V_LENGTH], 0.9 * vehicles[j, V_WIDTH]
-                if covers_corner(p[0], p[1], p[2], l1, w1, q[0], q[1], q[2], l2, w2) or covers_corner(
-                    q[0], q[1], q[2], l2, w2, p[0], p[1], p[2], l1, w1
-                ):
-                    found.append((i, j))
-                    break
-    out = np.empty((len(found), 2), dtype=np.int64)
-    for k in range(len(found)):
-        out[k, 0], out[k, 1] = found[k]
-    return out
 
 
 # --- highway-env's own, for comparison -----------------------------------------------------------------------------

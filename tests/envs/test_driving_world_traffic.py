@@ -13,18 +13,14 @@ from highway_env.road.road import Road, RoadNetwork
 from covis.envs.worlds.driving import ConnectedDrivingWorld, DrivingParams, _pedestrian_obstacle
 from covis.envs.worlds.driving_maps import MAPS, road_map
 from covis.envs.worlds.highway_peer import bare_intersection
-from covis.envs.worlds.traffic import (
-    ConnectedVehicle,
-    FastNetwork,
-    LaneTable,
+from covis.envs.worlds.traffic import ConnectedVehicle, FastNetwork, LaneTable, stock_twin, vehicle_table
+from covis.envs.worlds.traffic_kernels import (
     closest_lane,
     collisions,
     heading_at,
     position_at,
     projected,
-    stock_twin,
     translation,
-    vehicle_table,
 )
 
 STEPS = 100
