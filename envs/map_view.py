@@ -159,7 +159,7 @@ def field_of_view(T_world_camera: Array, fov: float, area: Area) -> tuple[NDArra
     inside = (slope * forward - np.abs(right)) / np.sqrt(1 + slope**2)  # metres from the side planes
     if T_world_camera[2, 2] < -0.5:
         inside = np.minimum(inside, slope * 0.75 * forward - np.abs(down))
-        fade = np.float32(0.75)
+        fade = np.float32(0.55)
     else:
         reach = np.float32(0.75 * area.metres)
         fade = np.clip(1 - np.hypot(offset[0], offset[1]) / reach, 0, 1)

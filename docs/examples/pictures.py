@@ -14,7 +14,7 @@ from covis.envs.paint import CLASS_COLORS, IDENTITY_COLORS, RIGHT, ROBOT_COLORS,
 from covis.envs.scenes import SCENES, parallel_env
 
 STEPS = 10
-COLORS = 192
+COLORS = 256
 VIVID = (*ROBOT_COLORS, *IDENTITY_COLORS, *CLASS_COLORS, RIGHT, WRONG)
 
 
