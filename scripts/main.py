@@ -8,6 +8,7 @@ from .benchmark import benchmark
 from .demo import demo
 from .import_data import app as import_data
 from .record import check, record
+from .sensitivity import sensitivity
 from .speed import speed
 from .train import app as train
 
@@ -23,6 +24,7 @@ app.command()(benchmark)
 app.command()(record)
 app.command()(check)
 app.command()(speed)
+app.command()(sensitivity)
 app.add_typer(import_data, name="import")
 app.add_typer(train, name="train")
 

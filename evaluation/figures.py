@@ -1,0 +1,104 @@
+"""Figures for the documentation and for reports, by matplotlib (extra `viz`)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Row = dict[str, Any]
+
+OURS = "#0072b2"
+MARKERS = "osD^vP*Xdph<>8"
+
+
+def _figure(columns: int = 1, width: float = 5.2, height: float = 3.8) -> tuple[Figure, Any]:
+    """A figure that no window and no global state knows of."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width * columns, height), layout="constrained")
+    axes = figure.subplots(1, columns, squeeze=False)[0]
+    for axis in axes:
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.grid(alpha=0.25, linewidth=0.6)
+    return figure, axes
+
+
+def save(figure: Figure, file: Path) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(file, dpi=120)
+
+
+def sensitivity_figure(rows: Sequence[Row]) -> Figure:
+    """F1 over lambda_1 and lambda_2, a panel per target; the published pair is framed."""
+    targets = list(dict.fromkeys(row["target"] for row in rows))
+    figure, axes = _figure(len(targets), 4.4, 3.4)
+    for axis, target in zip(axes, targets, strict=True):
+        own = [row for row in rows if row["target"] == target]
+        first = sorted({row["uncertainty_weight"] for row in own})
+        second = sorted({row["noncovisibility_weight"] for row in own})
+        grid = np.full((len(first), len(second)), np.nan)
+        for row in own:
+            grid[first.index(row["uncertainty_weight"]), second.index(row["noncovisibility_weight"])] = row["f1"]
+        axis.grid(False)
+        axis.imshow(grid, cmap="viridis", aspect="auto", origin="lower")
+        middle = 0.5 * (np.nanmin(grid) + np.nanmax(grid))
+        for (i, j), value in np.ndenumerate(grid):
+            color = "black" if value > middle else "white"
+            axis.text(j, i, f"{value:.3f}"[1:], ha="center", va="center", fontsize=8, color=color)
+        if 0.1 in first and 0.4 in second:
+            at = (second.index(0.4) - 0.5, first.index(0.1) - 0.5)
+            axis.add_patch(_frame(at))
+        axis.set_xticks(range(len(second)), [f"{x:g}" for x in second])
+        axis.set_yticks(range(len(first)), [f"{x:g}" for x in first])
+        axis.set_xlabel(r"$\lambda_2$ (non-covisibility)")
+        axis.set_ylabel(r"$\lambda_1$ (uncertainty)")
+        axis.set_title(f"{target}: F1 of rgm", fontsize=10)
+    return figure
+
+
+def scaling_figure(rows: Sequence[Row]) -> Figure:
+    """Time of a solve and peak memory against the number of objects, a line per method.
+
+    Rows hold `what`, `n`, `ours` (solves per second) and, where measured, `memory_mib`.
+    """
+    methods = list(dict.fromkeys(row["what"] for row in rows))
+    figure, (time, memory) = _figure(2, 5.6, 4.2)
+    for k, method in enumerate(methods):
+        own = sorted((row for row in rows if row["what"] == method), key=lambda row: row["n"])
+        style: dict[str, Any] = {"marker": MARKERS[k % len(MARKERS)], "markersize": 4, "linewidth": 1.1}
+        if method == "bayes":
+            style |= {"color": OURS, "linewidth": 2.4, "zorder": 5}
+        time.loglog([row["n"] for row in own], [1e3 / row["ours"] for row in own], label=method, **style)
+        used = [row for row in own if row.get("memory_mib") is not None]
+        memory.loglog([row["n"] for row in used], [max(row["memory_mib"], 0.1) for row in used], label=method, **style)
+    time.set_ylabel("time of a solve, ms")
+    memory.set_ylabel("peak memory above the start, MiB")
+    for axis in (time, memory):
+        axis.set_xlabel("objects a side")
+    memory.axhline(1024, color="0.6", linewidth=0.8, linestyle="--")
+    memory.legend(fontsize=7, ncol=2, frameon=False)
+    return figure
+
+
+def reliability_figure(curves: dict[str, Sequence[Any]]) -> Figure:
+    """Share of right matches against their score, a line per method; `curves` maps a name to its ReliabilityBins."""
+    figure, (axis,) = _figure(1, 4.2, 4.0)
+    axis.plot([0, 1], [0, 1], color="0.6", linewidth=0.8, linestyle="--")
+    for k, (name, bins) in enumerate(curves.items()):
+        axis.plot([b.score for b in bins], [b.accuracy for b in bins], marker=MARKERS[k % len(MARKERS)], label=name)
+    axis.set_xlabel("mean score of the bin")
+    axis.set_ylabel("share that was right")
+    axis.legend(fontsize=8, frameon=False)
+    return figure
+
+
+def _frame(at: tuple[float, float]) -> Any:
+    from matplotlib.patches import Rectangle
+
+    return Rectangle(at, 1, 1, fill=False, edgecolor="red", linewidth=1.8)
