@@ -51,7 +51,7 @@ class LearnedPerceptionParams:
     score: float = 0.3
     candidates: int = 64
     min_pixels: int = 40
-    depth_pixels: int = 16
+    depth_pixels: int = 12
     max_iou: float = 0.5
     max_inside: float = 0.75
 
@@ -240,7 +240,7 @@ class LearnedPerception:
         image = torch.zeros(n * D, dtype=torch.int64)
         box = found.boxes[:, None].expand(n, D, 4).reshape(-1, 4)
         seen = depth_features(dense, geometry, image, pixels.reshape(-1, 2), box)
-        log_depth, log_variance = self.network.depth(seen.expand(T, *seen.shape), T > 1, generator)
+        log_depth, log_variance = self.network.depth(seen, T > 1, generator, draws=T)
         z = torch.exp(log_depth.double().view(T, n, D)) * float(geometry.focal[0]) / REFERENCE_FOCAL_PX
         aleatoric = (z**2 * torch.exp(log_variance.double().view(T, n, D))).mean(0)
         epistemic = z.var(0, unbiased=False)

@@ -230,13 +230,16 @@ class Eyes(nn.Module):
         hidden = F.relu(self.class_in(dropout(found, p / 2, generator)))
         return self.class_out(dropout(hidden, p, generator))
 
-    def depth(self, seen: Tensor, sample: bool, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
-        """Log depth of the object's centre over focal length, and log-variance of it, (...,) each.
+    def depth(
+        self, seen: Tensor, sample: bool, generator: torch.Generator | None = None, draws: int = 1
+    ) -> tuple[Tensor, Tensor]:
+        """Log depth of the object's centre over focal length, and log-variance of it, (draws, k) each.
 
-        `seen` (..., c + OBJECT_GEOMETRY) as `depth_features` makes it.
+        `seen` (k, c + OBJECT_GEOMETRY) as `depth_features` makes it; with `sample` every draw is one from the dropout
+        posterior. The first layer is before all dropout and computed once.
         """
         p = self.params.depth_dropout if sample else 0.0
-        hidden = F.relu(self.depth_in(seen))
+        hidden = F.relu(self.depth_in(seen)).expand(draws, len(seen), self.params.head)
         hidden = F.relu(self.depth_mid(dropout(hidden, p, generator)))
         out = self.depth_out(dropout(hidden, p, generator))
         return out[..., 0], out[..., 1].clamp(-12, 3)
