@@ -22,7 +22,7 @@ from .pose import Array
 TEMPERS = (4.0, 2.0, 1.0)
 MAX_CHI2 = 6.0
 LEAST_EVIDENCE = -3.0
-SOURCE_PAIRS = 300
+SOURCE_PAIRS = 200
 
 
 class Prior(NamedTuple):

@@ -1,0 +1,310 @@
+"""`bayes`: exact references on small problems, invariances, degenerate problems, refusal, calibration."""
+
+from __future__ import annotations
+
+from itertools import combinations, permutations
+
+import numpy as np
+import pytest
+
+from covis.matching import ObjectGraph, RelativePose, bayes
+from covis.matching.bayes_assignment import assignment_marginals
+from covis.matching.bayes_prepare import class_evidence, height_correction, levelling_rotation
+from covis.matching.metrics import count, expected_calibration_error, is_correct, pooled
+from covis.matching.pose import invert
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def rotation_z(yaw: float) -> np.ndarray:
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def scene(rng: np.random.Generator, common: int, alone: int, noise: float = 0.02, classes: int = 4):
+    """Two robots 20 m from the middle of a field; `noise` is the depth error as a share of the range."""
+    objects = np.c_[rng.uniform(-12, 12, (common, 2)), np.zeros(common)]
+    kinds = rng.integers(0, classes, common)
+    views = []
+    for yaw in (0.0, rng.uniform(-np.pi, np.pi)):
+        R = rotation_z(yaw)
+        origin = R @ np.array([-20.0, 0.0, 0.0]) + 1.5 * UP
+        X = np.r_[objects, np.c_[rng.uniform(-12, 12, (alone, 2)), np.zeros(alone)]]
+        kind = np.r_[kinds, rng.integers(0, classes, alone)]
+        p = (X - origin) @ R
+        r = np.linalg.norm(p, axis=1, keepdims=True)
+        p = p * (1 + noise * rng.standard_normal(r.shape)) + 0.007 * r * rng.standard_normal(p.shape)
+        a = np.exp(2.0 * np.eye(classes)[kind] + 0.8 * rng.standard_normal((len(X), classes)))
+        order = rng.permutation(len(X))
+        identity = np.where(np.arange(len(X)) < common, np.arange(len(X)), rng.integers(10**3, 10**9, len(X)))
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = R, origin
+        graph = ObjectGraph(
+            p[order],
+            (a / a.sum(axis=1, keepdims=True))[order],
+            ((noise * r[:, 0]) ** 2)[order],
+            np.full(len(X), 0.01),
+            up=UP,
+        )
+        views.append((graph, identity[order], T))
+    return views[0], views[1]
+
+
+def matchings(n: int, m: int):
+    for k in range(min(n, m) + 1):
+        for rows in combinations(range(n), k):
+            for cols in permutations(range(m), k):
+                yield list(zip(rows, cols, strict=True))
+
+
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (2, 2), (3, 2), (3, 4), (4, 4)])
+def test_assignment_marginals_close_to_enumeration(n, m):
+    rng = np.random.default_rng(n * 10 + m)
+    for spread in (1.0, 3.0):
+        logs = spread * rng.standard_normal((n, m))
+        total, exact = 0.0, np.zeros((n, m))
+        for matching in matchings(n, m):
+            weight = np.exp(sum(logs[i, j] for i, j in matching))
+            total += weight
+            for i, j in matching:
+                exact[i, j] += weight
+        exact /= total
+        rows, cols = (x.ravel() for x in np.indices((n, m)))
+        out = np.empty(n * m)
+        log_z = assignment_marginals(rows, cols, logs.ravel(), n * m, n, m, 200, out)
+        # Sum-product is exact without cycles and near elsewhere.
+        tolerance = 1e-6 if min(n, m) == 1 else 0.08
+        np.testing.assert_allclose(out.reshape(n, m), exact, atol=tolerance)
+        assert abs(log_z - np.log(total)) < (1e-6 if min(n, m) == 1 else 0.4)
+
+
+def test_assignment_marginals_with_overwhelming_weights():
+    rows, cols = np.array([0, 0, 1]), np.array([0, 1, 0])
+    out = np.empty(3)
+    log_z = assignment_marginals(rows, cols, np.array([500.0, 1.0, 0.0]), 3, 2, 2, 100, out)
+    assert np.isfinite(log_z)
+    assert out[0] > 0.99
+    assert np.isfinite(out).all()
+
+
+@pytest.mark.parametrize("up", [UP, -UP, [0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.6, 0.0, 0.8]])
+def test_levelling_rotation(up):
+    L = levelling_rotation(np.asarray(up, dtype=float))
+    np.testing.assert_allclose(L @ np.asarray(up), UP, atol=1e-9)
+    np.testing.assert_allclose(L @ L.T, np.eye(3), atol=1e-9)
+    assert np.linalg.det(L) > 0
+
+
+def test_height_correction_is_the_exact_integral():
+    """log of the integral of N(X; z1, v1) N(X; z2, v2) / N(X; 0, V), by quadrature."""
+    V, cases = 0.5, [(0.1, -0.2, 0.3, 0.2), (0.0, 0.0, 0.45, 0.45), (1.0, 0.6, 0.01, 0.02)]
+    grid = np.linspace(-30, 30, 400001)
+
+    def log_normal(x, v):
+        return -0.5 * (x * x / v + np.log(2 * np.pi * v))
+
+    for z1, z2, v1, v2 in cases:
+        f = log_normal(grid - z1, v1) + log_normal(grid - z2, v2) - log_normal(grid, V)
+        expected = np.log(np.exp(f).sum() * (grid[1] - grid[0])) - log_normal(z1 - z2, v1 + v2)
+        p1, p2 = np.array([[0.0, 0.0, z1 + 5]]), np.array([[0.0, 0.0, z2 - 2]])
+        out = np.zeros((1, 1))
+        height_correction(p1, np.eye(3)[None] * v1, 5.0, p2, np.eye(3)[None] * v2, -2.0, V, out)
+        np.testing.assert_allclose(out[0, 0], expected, atol=1e-6)
+
+
+def test_class_evidence_prefers_equal_classes_and_rare_ones():
+    a = np.eye(3)[[0, 0, 0, 0, 1, 2]] * 0.9 + 0.05
+    out = np.zeros((6, 6))
+    tops = np.zeros(6, np.int64), np.zeros(6, np.int64)
+    class_evidence(a, np.zeros(6), a, np.zeros(6), 2.0, 0.01, out, *tops)
+    assert out[0, 0] > 0 > out[0, 4]
+    assert out[4, 4] > out[0, 0]
+    unknown = np.zeros((6, 6))
+    class_evidence(a, np.full(6, np.inf), a, np.full(6, np.inf), 2.0, 0.01, unknown, *tops)
+    np.testing.assert_allclose(unknown, 0, atol=1e-9)
+
+
+def test_finds_common_objects_and_the_pose():
+    rng = np.random.default_rng(0)
+    counts = []
+    for _ in range(15):
+        (a, ia, Ta), (b, ib, Tb) = scene(rng, common=7, alone=4)
+        matching = bayes(a, b)
+        counts.append(count(matching, ia, ib))
+        if counts[-1].correct >= 5:
+            error = invert(invert(Ta) @ Tb) @ matching.pose.T_source_target
+            assert np.linalg.norm(error[:3, 3]) < 2.0
+            assert abs(error[1, 0]) < 0.1
+    assert pooled(counts).f1 > 0.95
+
+
+def test_without_gravity():
+    rng = np.random.default_rng(1)
+    counts = []
+    for _ in range(5):
+        (a, ia, _), (b, ib, _) = scene(rng, common=8, alone=2, noise=0.01)
+        T = np.eye(4)
+        T[:3, :3] = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+        T[:3, :3] *= np.sign(np.linalg.det(T[:3, :3]))
+        b = b.transformed(T)
+        plain = ObjectGraph(b.positions, b.attributes, b.position_variance, b.attribute_variance)
+        counts.append(count(bayes(a, plain), ia, ib))
+    assert pooled(counts).f1 > 0.9
+
+
+def test_a_prior_pose_helps_and_a_refusal_needs_none():
+    rng = np.random.default_rng(2)
+    known, unknown = [], []
+    for _ in range(15):
+        (a, ia, Ta), (b, ib, Tb) = scene(rng, common=4, alone=8, noise=0.05)
+        truth = invert(Ta) @ Tb
+        noisy = truth.copy()
+        noisy[:3, :3] = truth[:3, :3] @ rotation_z(0.02 * rng.standard_normal())
+        noisy[:2, 3] += 0.3 * rng.standard_normal(2)
+        covariance = np.diag([0.09, 0.09, 1e-4, 1e-6, 1e-6, 4e-4])
+        known.append(count(bayes(a, b, prior=RelativePose(noisy, covariance)), ia, ib))
+        unknown.append(count(bayes(a, b), ia, ib))
+    assert pooled(known).f1 > 0.85
+    assert pooled(known).f1 > pooled(unknown).f1 + 0.2
+
+
+def test_refuses_where_nothing_is_common():
+    rng = np.random.default_rng(3)
+    retrieved = refused = 0
+    for _ in range(20):
+        (a, _, _), (b, _, _) = scene(rng, common=0, alone=10)
+        matching = bayes(a, b)
+        retrieved += len(matching)
+        refused += matching.pose is None
+        assert 0 <= matching.diagnostics["nothing_in_common"] <= 1
+    assert refused >= 15
+    assert retrieved <= 20
+
+
+def test_scores_are_calibrated_on_an_own_simulation():
+    rng = np.random.default_rng(4)
+    scores, correct = [], []
+    for k in range(150):
+        (a, ia, _), (b, ib, _) = scene(rng, common=0 if k % 3 == 0 else 5, alone=5, noise=0.04)
+        matching = bayes(a, b, min_score=0.05)
+        scores.append(matching.scores)
+        correct.append(is_correct(matching, ia, ib))
+    assert expected_calibration_error(np.concatenate(scores), np.concatenate(correct), bins=5) < 0.12
+
+
+def same(first, second):
+    np.testing.assert_array_equal(first[0], second[0])
+    np.testing.assert_allclose(first[1], second[1], atol=2e-3)
+
+
+def ordered(matching, source_names, target_names):
+    named = [(source_names[i], target_names[j]) for i, j in matching.pairs]
+    order = sorted(range(len(named)), key=named.__getitem__)
+    return np.array([named[k] for k in order]).reshape(-1, 2), matching.scores[order]
+
+
+def test_invariances():
+    rng = np.random.default_rng(5)
+    for _ in range(4):
+        (a, _, _), (b, _, _) = scene(rng, common=7, alone=3)
+        names = np.arange(10)
+        reference = ordered(bayes(a, b), names, names)
+        assert len(reference[0]) >= 5
+        sigma = rng.permutation(10)
+        same(reference, ordered(bayes(a.take(sigma), b), names[sigma], names))
+        same(reference, ordered(bayes(a, b.take(sigma)), names, names[sigma]))
+        swapped = bayes(b, a)
+        same(reference, ordered(type(swapped)(swapped.pairs[:, ::-1], swapped.scores), names, names))
+        # A sensor turned about its own origin sees the same rays and the same gravity.
+        T = np.eye(4)
+        T[:3, :3] = rotation_z(1.0)
+        same(reference, ordered(bayes(a.transformed(T), b), names, names))
+        T[:3, :3] = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+        same(reference, ordered(bayes(a, b.transformed(T)), names, names))
+
+
+def test_unit_of_length_does_not_matter():
+    (a, _, _), (b, _, _) = scene(np.random.default_rng(6), common=6, alone=4)
+
+    def scaled(g, s):
+        return ObjectGraph(g.positions * s, g.attributes, g.position_variance * s * s, g.attribute_variance, up=UP)
+
+    one, other = bayes(a, b), bayes(scaled(a, 0.1), scaled(b, 0.1))
+    np.testing.assert_array_equal(one.pairs, other.pairs)
+    np.testing.assert_allclose(one.scores, other.scores, atol=0.02)
+
+
+def graph(positions, up=UP, **kw):
+    return ObjectGraph.from_positions(np.asarray(positions, dtype=float).reshape(-1, 3), up=up, **kw)
+
+
+LINE = [[float(x), 2.0, 0.0] for x in range(1, 7)]
+CLOUD = np.random.default_rng(7).uniform(-5, 5, (6, 3)) + np.array([8.0, 0, 0])
+MIRROR = CLOUD * np.array([1.0, -1.0, 1.0])
+DEGENERATE = {
+    "empty": ([], CLOUD),
+    "both empty": ([], []),
+    "one": (CLOUD[:1], CLOUD),
+    "one each": (CLOUD[:1], CLOUD[:1]),
+    "two": (CLOUD[:2], CLOUD[:2]),
+    "collinear": (LINE, LINE),
+    "coincident": ([[3.0, 1.0, 0.5]] * 5, [[3.0, 1.0, 0.5]] * 4),
+    "at the origin": (np.zeros((3, 3)), CLOUD),
+    "mirror image": (CLOUD, MIRROR),
+    "unequal": (CLOUD, CLOUD[:3]),
+}
+
+
+@pytest.mark.parametrize("gravity", [True, False])
+@pytest.mark.parametrize("variance", [0.01, 0.0, np.inf])
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_degenerate_problems(name, variance, gravity):
+    a, b = DEGENERATE[name]
+    up = UP if gravity else None
+    source = graph(a, up, position_variance=variance, attribute_variance=variance)
+    target = graph(b, up, position_variance=variance, attribute_variance=variance)
+    for prior in (None, RelativePose(np.eye(4), 0.01 * np.eye(6)), RelativePose(np.eye(4), np.zeros((6, 6)))):
+        matching = bayes(source, target, prior=prior)
+        assert np.isfinite(matching.scores).all()
+        assert len(matching) <= min(len(source), len(target))
+        for hypothesis in matching.hypotheses:
+            assert np.isfinite(hypothesis.pose.T_source_target).all()
+            assert np.isfinite(hypothesis.pose.covariance).all()
+
+
+def test_mirror_image_is_not_matched_whole():
+    assert len(bayes(graph(CLOUD), graph(CLOUD))) == 6
+    assert len(bayes(graph(CLOUD), graph(MIRROR))) < 6
+
+
+def test_a_camera_that_looks_away_sees_nothing_in_common():
+    """Field of view as evidence: what should be seen and is not speaks against a pose."""
+    rng = np.random.default_rng(8)
+    R_camera = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    K = np.array([[320.0, 0, 320], [0, 320, 240], [0, 0, 1]])
+    objects = np.c_[rng.uniform(6, 20, 9), rng.uniform(-5, 5, 9), np.full(9, -1.0)]
+
+    def view(X):
+        return graph(X @ R_camera, R_camera.T @ UP, position_variance=0.05, intrinsics=K, image_size=(640, 480))
+
+    both = bayes(view(objects), view(objects + np.array([0.0, 1.0, 0.0])))
+    assert len(both) == 9
+    np.testing.assert_allclose(both.pose.T_source_target[:3, :3], np.eye(3), atol=0.05)
+
+
+@pytest.mark.parametrize("option", [{"min_score": 1.5}, {"common_probability": 0.0}, {"screened": 0}, {"refined": 0}])
+def test_bad_options_raise(option):
+    with pytest.raises(ValueError, match=next(iter(option))):
+        bayes(graph(CLOUD), graph(CLOUD), **option)
+
+
+def test_same_answer_twice_and_hypotheses_ordered():
+    (a, _, _), (b, _, _) = scene(np.random.default_rng(9), common=4, alone=7, noise=0.05)
+    one, two = bayes(a, b), bayes(a, b, rng=np.random.default_rng(1))
+    np.testing.assert_array_equal(one.pairs, two.pairs)
+    np.testing.assert_array_equal(one.scores, two.scores)
+    probabilities = [h.probability for h in one.hypotheses]
+    assert probabilities == sorted(probabilities, reverse=True)
+    assert sum(probabilities) + one.diagnostics["nothing_in_common"] <= 1 + 1e-9
+    for h in one.hypotheses:
+        RelativePose(h.pose.T_source_target, h.pose.covariance)
