@@ -13,8 +13,8 @@ from .pose import Array
 from .similarity import attribute_similarity, pair_affinity
 from .uncertainty import kronecker_plus, typical
 
-MAX_CANDIDATES = 8100
-"""Most candidates (n n') of a method that holds an affinity for every two of them, half a gigabyte in all."""
+MAX_CANDIDATES = 4900
+"""Most candidates (n n') of a method that holds an affinity for every two of them: 70 objects a side, 0.2 GB."""
 
 
 def check_size(method: str, source: ObjectGraph, target: ObjectGraph, most: int) -> None:

@@ -29,17 +29,19 @@ def distances(positions: Array) -> Array:
     return np.sqrt((difference**2).sum(axis=2))
 
 
-def distance_similarity(source_distance: Array, target_distance: Array, width_m2: float) -> Array:
-    """exp(-(s - s')^2 / width) of distances in m that broadcast against each other. Eq. (2)."""
-    return np.exp(-((source_distance - target_distance) ** 2) / width_m2)
-
-
+@njit(cache=True)
 def pair_affinity(source_distance: Array, target_distance: Array, width_m2: float) -> Array:
     """D (n, n', n, n') of Eq. (2); 0 where two matches share an object, as they exclude each other."""
-    D = distance_similarity(source_distance[:, None, :, None], target_distance[None, :, None, :], width_m2)
     n, m = len(source_distance), len(target_distance)
-    D[np.arange(n), :, np.arange(n), :] = 0.0
-    D[:, np.arange(m), :, np.arange(m)] = 0.0
+    D = np.zeros((n, m, n, m))
+    for i in range(n):
+        for j in range(i):
+            for ii in range(m):
+                for jj in range(m):
+                    if ii != jj:
+                        difference = source_distance[i, j] - target_distance[ii, jj]
+                        similar = np.exp(-difference * difference / width_m2)
+                        D[i, ii, j, jj] = D[j, jj, i, ii] = similar
     return D
 
 

@@ -268,7 +268,7 @@ def test_icp_starts_from_the_prior_if_there_is_one():
 # Limits and bad options
 
 
-@pytest.mark.parametrize(("matcher", "n"), [(rrwm, 91), (clipper, 91), (rrwhm, 33), (mos, 33), (bcagm, 33), (icp, 33)])
+@pytest.mark.parametrize(("matcher", "n"), [(rrwm, 71), (clipper, 71), (rrwhm, 33), (mos, 33), (bcagm, 33), (icp, 33)])
 def test_too_many_objects_are_refused_with_the_numbers(matcher, n):
     graph = ObjectGraph.from_positions(np.random.default_rng(0).normal(size=(n, 3)))
     with pytest.raises(ValueError, match=f"accepts at most .* candidate matches .* got {n} x {n}"):
