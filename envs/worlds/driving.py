@@ -22,7 +22,7 @@ from .kerbs import Ground, to_world
 from .lighting import sample_light
 from .road_surface import road_surface
 from .street import Catalogue, Street
-from .street_meshes import barrier, building, bus, car, person, sign, signal, tree, truck, van
+from .street_meshes import barrier, building, bus, car, person, post, sign, signal, tree, truck, van
 from .traffic import ConnectedVehicle, FastNetwork, FastRoad, Obstacle, TrafficVehicle, make_road
 from .traffic_kernels import corners, rectangles_intersect
 from .world import Array, Light, Mesh, SceneGenerationError, Snapshot
@@ -125,6 +125,7 @@ class ConnectedDrivingWorld:
         positions = np.vstack([to_world(np.array([v.position for v in vehicles])), street.objects.places()])
         headings = np.array([-v.heading for v in vehicles] + street.objects.headings)
         sizes = np.array([KINDS[v.kind].size for v in vehicles] + street.objects.sizes)
+        heights = np.array([KINDS[v.kind].size[2] / 2 for v in vehicles] + street.objects.heights)
         m = len(positions)
         velocities = np.zeros((m, 3))
         speeds = np.array([v.speed for v in vehicles])
@@ -142,7 +143,7 @@ class ConnectedDrivingWorld:
             time=episode.time,
             identity=np.concatenate([[v.identity for v in vehicles], episode.street_identity]).astype(np.int64),
             object_class=np.array([KINDS[v.kind].object_class for v in vehicles] + street.objects.classes, np.int64),
-            positions=np.column_stack([positions, sizes[:, 2] / 2]),
+            positions=np.column_stack([positions, heights]),
             velocities=velocities,
             headings=headings,
             sizes=sizes,
@@ -435,6 +436,7 @@ def _meshes(roads: RoadMap, ground: Ground) -> tuple[tuple[Mesh, ...], Catalogue
     groups = {
         "signals": [signal(color) for color in ("red", "amber", "green")],
         "signs": [sign(kind) for kind in ("limit", "stop", "yield", "info")],
+        "posts": [post(0.08, 2.4), post(0.045, 2.2)],
         "trees": [tree("round"), tree("tall")],
         "houses": [building(*size, floors) for size, floors in zip(FOOTPRINTS, FLOORS, strict=True)],
     }

@@ -25,8 +25,10 @@ CLASSES = (
     ObjectClass("road sign", 0.05),
 )
 PERSON_SIZE: Size = (0.66, 0.66, 1.76)
-SIGNAL_SIZE: Size = (0.36, 0.6, 3.44)
-SIGN_SIZE: Size = (0.14, 0.92, 2.7)
+SIGNAL_SIZE: Size = (0.36, 0.6, 1.18)
+SIGN_SIZE: Size = (0.14, 0.92, 0.92)
+SIGNAL_HEIGHT_M, SIGN_HEIGHT_M = 2.85, 2.24
+"""Of the middle of what detectors call a signal or a sign; the post below is scenery."""
 
 WHITE: Tint = (1.0, 1.0, 1.0)
 COMMON_PAINTS: tuple[Tint, ...] = ((0.95, 0.95, 0.95), (0.62, 0.63, 0.66))

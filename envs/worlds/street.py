@@ -17,8 +17,10 @@ from .driving_params import (
     PEDESTRIAN,
     PERSON_SIZE,
     SIGN,
+    SIGN_HEIGHT_M,
     SIGN_SIZE,
     SIGNAL,
+    SIGNAL_HEIGHT_M,
     SIGNAL_SIZE,
     WHITE,
     DrivingParams,
@@ -56,6 +58,7 @@ class Catalogue:
     person: int
     signals: tuple[int, int, int]
     signs: tuple[int, ...]
+    posts: tuple[int, int]
     trees: tuple[int, ...]
     houses: tuple[int, ...]
     footprints: tuple[tuple[float, float], ...]
@@ -63,7 +66,7 @@ class Catalogue:
 
 @dataclass
 class Things:
-    """n things standing on the ground: positions (n, 2) m, headings rad, classes, sizes (n, 3) m, meshes and tints."""
+    """n things: positions (n, 2) m, headings rad, classes, sizes (n, 3) m, meshes, tints, middle heights (n,) m."""
 
     positions: list[tuple[float, float]] = field(default_factory=list)
     headings: list[float] = field(default_factory=list)
@@ -71,15 +74,17 @@ class Things:
     sizes: list[Size] = field(default_factory=list)
     meshes: list[int] = field(default_factory=list)
     tints: list[Tint] = field(default_factory=list)
+    heights: list[float] = field(default_factory=list)
 
-    def add(self, site: Site, kind: int, size: Size, mesh: int, tint: Tint) -> None:
-        """Append one."""
+    def add(self, site: Site, kind: int, size: Size, mesh: int, tint: Tint, height: float | None = None) -> None:
+        """Append one; without a `height` it stands on the ground."""
         self.positions.append(site[0])
         self.headings.append(site[1])
         self.classes.append(kind)
         self.sizes.append(size)
         self.meshes.append(mesh)
         self.tints.append(tint)
+        self.heights.append(size[2] / 2 if height is None else height)
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -185,7 +190,8 @@ class Street:
         self._add_parked()
         self._add_signs()
         for site in signals:
-            self.objects.add(site, SIGNAL, SIGNAL_SIZE, catalogue.signals[GREEN], WHITE)
+            self.objects.add(site, SIGNAL, SIGNAL_SIZE, catalogue.signals[GREEN], WHITE, SIGNAL_HEIGHT_M)
+            self.scenery.add(site, -1, SIGNAL_SIZE, catalogue.posts[0], WHITE)
         self._add_houses()
         self._add_trees()
         self.solids = np.vstack([self.objects.footprints(), self.scenery.footprints()])
@@ -249,7 +255,8 @@ class Street:
             if site is not None:
                 usual = self._rng.uniform() < self._params.look_alike_fraction
                 mesh = common if usual else rare[int(self._rng.integers(len(rare)))]
-                self.objects.add(site, SIGN, SIGN_SIZE, mesh, WHITE)
+                self.objects.add(site, SIGN, SIGN_SIZE, mesh, WHITE, SIGN_HEIGHT_M)
+                self.scenery.add(site, -1, SIGN_SIZE, self._catalogue.posts[1], WHITE)
 
     def _add_houses(self) -> None:
         for _ in range(self._params.n_buildings):

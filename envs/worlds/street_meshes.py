@@ -145,17 +145,20 @@ def person() -> Mesh:
     return merge(*legs, *arms, translate(torso, (0, 0, 0.82)), head)
 
 
+def post(radius: float, height: float) -> Mesh:
+    """What a signal or a sign hangs on."""
+    return cylinder(radius, height, (118, 121, 126), sides=6, center=(0, 0, height / 2))
+
+
 def signal(lit: str) -> Mesh:
-    """A traffic light 3.4 m high whose lamps face +x; `lit` is "red", "amber" or "green"."""
+    """A traffic light, 2.3 to 3.4 m above the ground, whose lamps face +x; `lit` is "red", "amber" or "green"."""
     colors = {"red": ((255, 46, 36), (58, 22, 20)), "amber": ((255, 190, 40), (60, 48, 18))}
     colors["green"] = ((60, 255, 120), (16, 56, 32))
     lamps = [
         box((0.06, 0.24, 0.24), colors[name][0] if name == lit else colors[name][1], (0.18, 0, z))
         for name, z in (("red", 3.15), ("amber", 2.85), ("green", 2.55))
     ]
-    post = cylinder(0.08, 2.4, (92, 96, 100), sides=6, center=(0, 0, 1.2))
     return merge(
-        post,
         box((0.3, 0.42, 1.0), (34, 36, 40), (0, 0, 2.85)),
         box((0.04, 0.6, 1.18), (20, 21, 24), (-0.02, 0, 2.85)),
         *lamps,
@@ -163,8 +166,7 @@ def signal(lit: str) -> Mesh:
 
 
 def sign(kind: str) -> Mesh:
-    """A road sign 2.7 m high facing +x: "limit", "stop", "yield" or "info"."""
-    post = cylinder(0.045, 2.2, (150, 152, 156), sides=6, center=(0, 0, 1.1))
+    """A road sign, 1.8 to 2.7 m above the ground, facing +x: "limit", "stop", "yield" or "info"."""
     face = {"limit": (10, 0.0), "stop": (8, np.pi / 8), "yield": (3, np.pi + np.pi / 3), "info": (4, np.pi / 4)}
     sides, turn = face[kind]
     rim = {"limit": (205, 30, 34), "stop": (200, 28, 30), "yield": (205, 30, 34), "info": (36, 84, 170)}[kind]
@@ -177,7 +179,7 @@ def sign(kind: str) -> Mesh:
         "yield": box((0.065, 0.02, 0.02), WHITE),
         "info": box((0.08, 0.1, 0.36), WHITE),
     }[kind]
-    return merge(post, *(translate(part, (0.06, 0, 2.24)) for part in (disc, middle, mark)))
+    return merge(*(translate(part, (0.06, 0, 2.24)) for part in (disc, middle, mark)))
 
 
 def tree(kind: str = "round") -> Mesh:
