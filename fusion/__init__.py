@@ -3,16 +3,39 @@
 from covis.fusion import fuse, fuse_own, register
 """
 
+from .channel import Channel, ChannelOptions
 from .gaussian import Gaussian, covariance_intersection, fuse_gaussians, fuse_isotropic, fused_variance, fusion_gains
-from .objects import FusedObjects, Groups, OwnObjects, fuse, fuse_own, group_detections, own_objects, relative_pose
+from .objects import (
+    FusedObjects,
+    Groups,
+    OwnObjects,
+    agreement,
+    fuse,
+    fuse_own,
+    group_detections,
+    own_objects,
+    relative_pose,
+)
+from .refine import Refined, refine
 from .registration import RegistrationError, register
+from .sequence import PairOptions, PairTracker
+from .tracking import Batch, Tracker, TrackerOptions
 
 __all__ = [
+    "Batch",
+    "Channel",
+    "ChannelOptions",
     "FusedObjects",
     "Gaussian",
     "Groups",
     "OwnObjects",
+    "PairOptions",
+    "PairTracker",
+    "Refined",
     "RegistrationError",
+    "Tracker",
+    "TrackerOptions",
+    "agreement",
     "covariance_intersection",
     "fuse",
     "fuse_gaussians",
@@ -22,6 +45,7 @@ __all__ = [
     "fusion_gains",
     "group_detections",
     "own_objects",
+    "refine",
     "register",
     "relative_pose",
 ]

@@ -40,8 +40,8 @@ class PoseFilterOptions:
     walk_std_rad: float = 0.01
     odometry_std_m: float = 0.01
     odometry_std_per_m: float = 0.05
-    odometry_std_rad: float = 0.02
-    odometry_std_per_rad: float = 0.15
+    odometry_std_rad: float = 0.012
+    odometry_std_per_rad: float = 0.1
     lost: float = 0.005
     overlooked: float = 0.1
     extent_m: float = 60.0

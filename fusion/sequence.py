@@ -23,12 +23,15 @@ class PairOptions:
     Attributes:
         filter: of the relative pose.
         trust: probability of a pose from which it is handed to the matcher as prior.
+        refuse: while none is trusted, matches whose score times the best pose's probability is lower are not made.
+        widen: factor on the prior's covariance; above 1 because errors of successive views are alike.
         min_registered: matches a matcher without poses must give for one to be estimated.
     """
 
     filter: PoseFilterOptions = field(default_factory=PoseFilterOptions)
-    trust: float = 0.5
-    refuse: float = 0.0
+    trust: float = 0.7
+    refuse: float = 0.3
+    widen: float = 1.0
     min_registered: int = 4
 
 
@@ -122,6 +125,7 @@ class PairTracker:
             return _believed(alone, choice.probability, self.options.refuse)
         if choice.component >= 0:
             mean, covariance = before[choice.component]
+            covariance = covariance * self.options.widen
             prior = from_levelled(mean, covariance, *self._ups)
         elif choice.hypothesis > 0:
             prior = found[choice.hypothesis][0]
