@@ -13,7 +13,7 @@ from .extras import require
 from .methods import Method
 from .settings import SCENE_NAMES, Settings
 
-METHODS = ("random", "reid", "rgm", "oracle")
+METHODS = ("random", "reid", "rgm", "bayes", "oracle")
 EPISODES = 2
 COLUMNS = (
     ("method", "method"),
