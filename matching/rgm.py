@@ -323,7 +323,7 @@ def support(terms: Terms) -> Array:
     n, m = terms.attribute.shape
     affinity = terms.pair.reshape(n * m, n * m).copy()
     affinity.flat[:: n * m + 1] = terms.attribute.ravel()
-    return reweighted_random_walk(affinity, n, m, iterations=30)
+    return reweighted_random_walk(affinity, n, m, iterations=30, sinkhorn_iterations=10)
 
 
 def solve(
