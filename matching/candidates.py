@@ -6,6 +6,7 @@ A candidate match of source object i and target object i' has the number i * n' 
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 from scipy.optimize import linear_sum_assignment
 
 from .graph import Matching, ObjectGraph
@@ -54,13 +55,19 @@ def affinity_matrix(
     n, m = len(source), len(target)
     A = attribute_similarity(source.attributes, target.attributes) ** attribute_weight
     K = pair_affinity(source_distance, target_distance, width_m2)
-    if attribute_weight > 0:
-        K *= A[:, :, None, None]
-        K *= A[None, None]
     K = K.reshape(n * m, n * m)
     if attribute_weight > 0:
-        K.flat[:: n * m + 1] = A.ravel()
+        weigh(K, A.ravel())
     return K
+
+
+@njit(cache=True)
+def weigh(K: Array, a: Array) -> None:
+    """Scale the rows and columns of K (k, k) by a (k,), in place, and put a on its diagonal."""
+    for x in range(len(a)):
+        for y in range(len(a)):
+            K[x, y] *= a[x] * a[y]
+        K[x, x] = a[x]
 
 
 def assignment(support: Array, scores: Array | None = None) -> Matching:

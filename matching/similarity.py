@@ -40,8 +40,9 @@ def pair_affinity(source_distance: Array, target_distance: Array, width_m2: floa
                 for jj in range(m):
                     if ii != jj:
                         difference = source_distance[i, j] - target_distance[ii, jj]
-                        similar = np.exp(-difference * difference / width_m2)
-                        D[i, ii, j, jj] = D[j, jj, i, ii] = similar
+                        exponent = difference * difference / width_m2
+                        if exponent < 100.0:  # below that, exp() is zero for every purpose
+                            D[i, ii, j, jj] = D[j, jj, i, ii] = np.exp(-exponent)
     return D
 
 
