@@ -286,6 +286,7 @@ def _work(
     """The life of a worker but the first."""
     torch.set_num_threads(1)
     keep_memory()
+    threading.Thread(target=_die_with_parent, daemon=True).start()
     state = fresh(params, network)
     state.step = step
     _unflatten(flat[0], state.network)
@@ -302,6 +303,14 @@ def _work(
             _meet(worker, state.network, flat, barrier)
     except threading.BrokenBarrierError:
         return
+
+
+def _die_with_parent() -> None:
+    """A killed training leaves no workers behind."""
+    parent = torch.multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _meet(worker: int, network: Eyes, flat: Tensor, barrier: Any) -> None:
