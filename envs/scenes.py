@@ -47,9 +47,7 @@ SCENES: dict[str, Scene] = {
     "connected_driving": Scene(
         ConnectedDrivingWorld, driving_params.preset, 2, PoseNoise(1.0, 0.0175), LocalizationReward(cap_m=5.0)
     ),
-    "multi_robot": Scene(
-        MultiRobotWorld, multi_robot.preset, 2, PoseNoise(0.3, 0.02), LocalizationReward(cap_m=2.0)
-    ),
+    "multi_robot": Scene(MultiRobotWorld, multi_robot.preset, 2, PoseNoise(0.3, 0.02), LocalizationReward(cap_m=2.0)),
     "aerial_ground": Scene(
         AerialGroundWorld, aerial_ground.preset, 2, PoseNoise(0.2, 0.02), LocalizationReward(cap_m=2.0)
     ),

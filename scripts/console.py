@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 err = Console(stderr=True)
-out = Console() if Console().is_terminal else Console(width=140)
+out = Console() if Console().is_terminal else Console(width=180)
 
 
 def fail(error: BaseException | str) -> NoReturn:

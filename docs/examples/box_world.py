@@ -1,6 +1,7 @@
 """A scene of one's own: coloured boxes on a plain, robots that turn and drive."""
 
 import numpy as np
+
 from covis.envs.camera.shapes import box
 from covis.envs.worlds.world import Light, ObjectClass, Snapshot
 

@@ -1,6 +1,7 @@
 """Scenes by name, by path, and in PettingZoo's registry."""
 
 import pytest
+
 from covis.envs.scenes import SCENES, parallel_env
 
 
