@@ -17,8 +17,10 @@ from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
+from .camera.effects import EffectRanges
 from .camera.raster import Frame as CameraFrame
-from .camera.raster import Rasterizer, intrinsics_from_fov
+from .camera.raster import Look, intrinsics_from_fov
+from .camera.rig import CameraRig, Exposures
 from .claims import Claims, action_space, decode
 from .scoring import LocalizationReward, Reward, StepScore, Truth, score, tight_boxes
 from .seeding import EpisodeSeeds, Seed
@@ -56,6 +58,7 @@ class _Episode:
 
     noise_rng: np.random.Generator
     id_rng: np.random.Generator
+    exposures: Exposures
     steps: int
     claims: list[Claims]
     score: StepScore | None
@@ -101,6 +104,10 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         min_pixels: an object with fewer visible pixels does not count as visible.
         sensors: parts of `("image", "depth", "instances")`; the last two are privileged.
         messages: add the partners' claims of the last step to the observation.
+        backend: "raster" (our camera), "tiny" or "egl" (pybullet's renderers).
+        look: shading, shadows and so on of our camera; None = all of it.
+        effects: ranges of exposure, noise, blur, lens and so on, from which every episode draws each camera's; None =
+            ideal cameras. A lens that distorts bends all images alike; `intrinsics` stay those of the pinhole.
         seed: of the first reset that brings none; later ones go on from it. None draws one.
         render_mode: `rgb_array`, `human` or None.
 
@@ -122,6 +129,9 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         min_pixels: int = 60,
         sensors: Sequence[str] = ("image",),
         messages: bool = False,
+        backend: str = "raster",
+        look: Look | None = None,
+        effects: EffectRanges | None = None,
         seed: Seed | None = None,
         render_mode: Literal["rgb_array", "human"] | None = None,
     ) -> None:
@@ -138,6 +148,9 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
             min_pixels=min_pixels,
             sensors=sensors,
             messages=messages,
+            backend=backend,
+            look=look,
+            effects=effects,
             seed=seed,
             render_mode=render_mode,
         )
@@ -184,7 +197,9 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
             [intrinsics_from_fov(self.width, self.height, float(f)) for f in self.world.horizontal_fov_rad]
         )
         self._seeds = EpisodeSeeds.start(seed)
-        self._rasterizer: Rasterizer | None = None
+        self._rig = CameraRig(
+            self.world.meshes, self.width, self.height, self.intrinsics, backend=backend, look=look, effects=effects
+        )
         self._painter: Any = None
         self._window: Any = None
         self._episode: _Episode | None = None
@@ -259,20 +274,22 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         if seed is not None:
             self._seeds = EpisodeSeeds.start(seed)
         episode_seed, self._seeds = self._seeds.next()
-        world_rng, noise_rng, id_rng = (np.random.default_rng(s) for s in episode_seed.spawn(3))
+        world_rng, noise_rng, id_rng, camera_rng = (np.random.default_rng(s) for s in episode_seed.spawn(4))
         self.world.reset(world_rng)
         self.agents = list(self.possible_agents)
         snapshot = self._take_snapshot()
         n = len(self.agents)
+        exposures = self._rig.begin(camera_rng)
         self._episode = _Episode(
             noise_rng=noise_rng,
             id_rng=id_rng,
+            exposures=exposures,
             steps=0,
             claims=[Claims.empty(self.max_detections, n - 1) for _ in self.agents],
             score=None,
             sums=np.zeros((n, N_SUMS)),
             totals=np.zeros((n, N_SUMS)),
-            now=self._look(snapshot),
+            now=self._look(snapshot, exposures),
             before=None,
             trail=[snapshot.T_world_camera[:, :2, 3].copy()],
         )
@@ -307,7 +324,7 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         self.world.step(np.stack([control for control, _ in decoded]))
         episode.steps += 1
         snapshot = self._take_snapshot()
-        episode.before, episode.now = episode.now, self._look(snapshot)
+        episode.before, episode.now = episode.now, self._look(snapshot, episode.exposures)
         episode.trail.append(snapshot.T_world_camera[:, :2, 3].copy())
         crashed = bool(self.world.ends_on_collision and snapshot.collided.any())
         over = episode.steps >= self.max_cycles
@@ -368,12 +385,10 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
             )
         return snapshot
 
-    def _look(self, snapshot: Snapshot) -> Instant:
+    def _look(self, snapshot: Snapshot, exposures: Exposures) -> Instant:
         """Render an instant and note what is true."""
-        if self._rasterizer is None:
-            self._rasterizer = Rasterizer(self.world.meshes, self.width, self.height)
-        n, m = self.world.n_robots, len(snapshot.identity)
-        frames = tuple(self._rasterizer.render(snapshot, i, self.intrinsics[i]) for i in range(n))
+        m = len(snapshot.identity)
+        frames = self._rig.shoot(snapshot, exposures)
         tight = [tight_boxes(frame.instances, m) for frame in frames]
         truth = Truth(
             identity=snapshot.identity,
@@ -517,6 +532,7 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
 
     def close(self) -> None:
         self.world.close()
+        self._rig.close()
         if self._window is not None:
             self._window.close()
             self._window = None

@@ -11,6 +11,7 @@ from typing import Any
 from pettingzoo import AECEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 
+from .camera.effects import EffectRanges
 from .collaborative import CollaborativeEnv
 from .scoring import LocalizationReward
 from .sensing import PoseNoise
@@ -32,6 +33,7 @@ class Scene:
         n_robots: default number of robots with cameras.
         pose_noise: errors of the robots' reported poses.
         reward: the team's default reward.
+        effects: ranges of the cameras' character; None = ideal cameras.
         version: of rendering and presets; a change that alters results raises it.
     """
 
@@ -40,8 +42,12 @@ class Scene:
     n_robots: int
     pose_noise: PoseNoise
     reward: LocalizationReward
+    effects: EffectRanges | None = None
     version: int = 0
 
+
+REAL_CAMERAS = EffectRanges(k1=(0.0, 0.0), k2=(0.0, 0.0))
+"""Varied as real cameras vary, but for the lens, which robots rectify."""
 
 SCENES: dict[str, Scene] = {
     "connected_driving": Scene(
@@ -49,7 +55,7 @@ SCENES: dict[str, Scene] = {
     ),
     "multi_robot": Scene(MultiRobotWorld, multi_robot.preset, 2, PoseNoise(0.3, 0.02), LocalizationReward(cap_m=2.0)),
     "aerial_ground": Scene(
-        AerialGroundWorld, aerial_ground.preset, 2, PoseNoise(0.2, 0.02), LocalizationReward(cap_m=2.0)
+        AerialGroundWorld, aerial_ground.preset, 2, PoseNoise(0.2, 0.02), LocalizationReward(cap_m=2.0), REAL_CAMERAS
     ),
     "target_localization": Scene(
         TargetLocalizationWorld, target_localization.preset, 2, PoseNoise(0.02, 0.01), LocalizationReward(cap_m=0.5)
@@ -85,6 +91,7 @@ def parallel_env(
         "name": f"{scene}_v{spec.version}",
         "pose_noise": spec.pose_noise,
         "reward": spec.reward,
+        "effects": spec.effects if options.get("backend", "raster") == "raster" else None,
     }
     return CollaborativeEnv(make_world, **(defaults | options))
 

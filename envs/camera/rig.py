@@ -1,0 +1,94 @@
+"""The cameras of all robots of an environment: one backend, one look, and effects that each episode draws anew."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..worlds.world import Array, Mesh, Snapshot
+from .backends import Camera, make_camera
+from .effects import EffectRanges, SensorCamera, SensorEffects
+from .raster import Frame, Look, Rasterizer
+
+BACKENDS = ("raster", "tiny", "egl")
+
+
+@dataclass(frozen=True, eq=False)
+class Exposures:
+    """One episode's cameras: each robot's effects, and what draws their noise. A deep copy is their saved state."""
+
+    effects: tuple[SensorEffects, ...]
+    rng: np.random.Generator
+
+
+class CameraRig:
+    """Cameras of N robots; the renderer is built at the first picture.
+
+    Args:
+        meshes: every mesh a snapshot may refer to.
+        width, height: pixels.
+        intrinsics: (N, 3, 3).
+        backend: "raster" (ours), "tiny" or "egl" (pybullet's).
+        look: of our camera; None = `Look()`.
+        effects: ranges from which every episode draws each camera's character; None = ideal cameras.
+
+    Raises:
+        ValueError: no such backend; a look or effects for a backend other than ours.
+    """
+
+    def __init__(
+        self,
+        meshes: Sequence[Mesh],
+        width: int,
+        height: int,
+        intrinsics: Array,
+        *,
+        backend: str = "raster",
+        look: Look | None = None,
+        effects: EffectRanges | None = None,
+    ) -> None:
+        if backend not in BACKENDS:
+            raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
+        if backend != "raster" and (look is not None or effects is not None):
+            raise ValueError(f"look and effects are of our own camera, backend 'raster'; got backend={backend!r}")
+        self.intrinsics = intrinsics
+        self._meshes, self._width, self._height = tuple(meshes), width, height
+        self._backend, self._look, self._ranges = backend, look, effects
+        self._camera: Camera | None = None
+        self._sensors: list[SensorCamera] = []
+        self._sensors_of: tuple[SensorEffects, ...] = ()
+
+    def begin(self, rng: np.random.Generator) -> Exposures:
+        """A new episode's cameras."""
+        if self._ranges is None:
+            return Exposures((), rng)
+        return Exposures(tuple(self._ranges.sample(rng) for _ in self.intrinsics), rng)
+
+    def shoot(self, snapshot: Snapshot, exposures: Exposures) -> tuple[Frame, ...]:
+        """A fresh frame of every robot's camera."""
+        camera = self._renderer()
+        if not exposures.effects:
+            return tuple(camera.render(snapshot, i, K) for i, K in enumerate(self.intrinsics))
+        assert isinstance(camera, Rasterizer)
+        if self._sensors_of != exposures.effects:
+            self._sensors_of = exposures.effects
+            self._sensors = [
+                SensorCamera(camera, K, effects) for K, effects in zip(self.intrinsics, exposures.effects, strict=True)
+            ]
+        return tuple(sensor.render(snapshot, i, exposures.rng) for i, sensor in enumerate(self._sensors))
+
+    def close(self) -> None:
+        """Release a pybullet backend; calling it twice is harmless."""
+        close = getattr(self._camera, "close", None)
+        if close is not None:
+            close()
+        self._camera = None
+
+    def _renderer(self) -> Camera:
+        if self._camera is None:
+            options: dict[str, Any] = {"look": self._look or Look()} if self._backend == "raster" else {}
+            self._camera = make_camera(self._backend, self._meshes, self._width, self._height, **options)
+        return self._camera
