@@ -20,10 +20,16 @@ from .pose import Array, RelativePose
 HALF_RANGE_QUANTILE = 0.75
 OCCLUDER = 0.022
 OCCLUDED = 0.75
-POSE_CONCENTRATION = 1.7
+POSE_CONCENTRATION = 1.8
 """Nats by which poses of views that share objects are more concentrated than the uniform prior says (fitted)."""
 
 LEAST_HYPOTHESIS = 0.01
+ALTERNATIVES: tuple[tuple[float, float], ...] = ((0.2, 0.0), (4.0, 0.0), (1.0, 0.07))
+"""Factor on all variances, and prior deviation of the robots' depth scales, tried where the reported ones fit badly."""
+
+OTHER_SCALE_PROBABILITY = 0.05
+DOUBTFUL = 2.0
+"""Log evidence below which wrong variances and scales are considered."""
 
 
 def bayes(
@@ -32,10 +38,10 @@ def bayes(
     *,
     prior: RelativePose | None = None,
     rng: np.random.Generator | None = None,
-    min_score: float = 0.4,
+    min_score: float = 0.42,
     common_probability: float = 0.5,
     bearing_std_rad: float = DEFAULT_BEARING_STD_RAD,
-    class_sharpness: float = 2.5,
+    class_sharpness: float = 2.25,
     mislabel: float = 0.01,
     extent: float = 0.018,
     depth_offset: float = 0.035,
@@ -44,6 +50,7 @@ def bayes(
     detection: float = 0.9,
     screened: int = 300,
     refined: int = 8,
+    rescale: bool = True,
     max_hypotheses: int = 5,
 ) -> Matching:
     """Match by evidence over relative poses.
@@ -69,6 +76,7 @@ def bayes(
         detection: probability of detecting a near object in plain view.
         screened: hypotheses verified against all detections.
         refined: hypotheses refined to modes of the posterior.
+        rescale: where nothing fits well, also try other scales of the variances and a scale of each robot's depths.
         max_hypotheses: most explanations to return.
 
     Returns:
@@ -89,20 +97,25 @@ def bayes(
     gravity = source.up is not None and target.up is not None
     L_a, L_b = _levelling(source, gravity), _levelling(target, gravity)
     view_a, view_b = _views(source, target, L_a, L_b, detection)
-    problem = prepare(
-        *_arrays(source),
-        L_a,
-        *_arrays(target),
-        L_b,
-        bearing_std_rad**2,
-        gravity,
-        source.intrinsics is not None and target.intrinsics is not None,
-        view_a.known > 0 and view_b.known > 0,
-        q,
-    )
-    pose_prior = _pose_prior(prior, problem, L_a, L_b, gravity)
-    solve = solve_levelled if gravity else solve_spatial
-    modes = solve(problem, pose_prior, view_a, view_b, q, screened, refined)
+
+    def explain(scale: float, depth_scale_std: float) -> Modes:
+        problem = prepare(
+            *_arrays(source, scale),
+            L_a,
+            *_arrays(target, scale),
+            L_b,
+            bearing_std_rad**2,
+            gravity,
+            source.intrinsics is not None and target.intrinsics is not None,
+            view_a.known > 0 and view_b.known > 0,
+            q._replace(scale_std=depth_scale_std),
+        )
+        solve = solve_levelled if gravity else solve_spatial
+        return solve(problem, _pose_prior(prior, problem, L_a, L_b, gravity), view_a, view_b, q, screened, refined)
+
+    modes = explain(1.0, scale_std)
+    if rescale and modes.log_evidence.max(initial=-math.inf) < DOUBTFUL:
+        modes = _joined([modes, *(explain(*x) for x in ALTERNATIVES)])
     if prior is None:
         weights, P = mix(
             modes, math.log(common_probability) + POSE_CONCENTRATION, math.log1p(-common_probability), n, m
@@ -135,9 +148,27 @@ def _levelling(graph: ObjectGraph, gravity: bool) -> Array:
     return levelling_rotation(graph.up) if gravity else np.eye(3)
 
 
-def _arrays(graph: ObjectGraph) -> tuple[Array, Array, Array, Array, Array]:
-    covariances = np.empty((0, 3, 3)) if graph.covariances is None else graph.covariances
-    arrays = graph.positions, graph.position_variance, covariances, graph.attributes, graph.attribute_variance
+def _joined(alternatives: list[Modes]) -> Modes:
+    """Modes under the reported variances (first) and under others, which are improbable beforehand."""
+    count = np.concatenate([np.full(len(x.log_evidence), k) for k, x in enumerate(alternatives)])
+    size = min(x.information.shape[1] for x in alternatives)
+    bias = min(x.bias.shape[1] for x in alternatives)
+    trimmed = [x._replace(bias=x.bias[:, :bias], information=_marginal(x.information, size)) for x in alternatives]
+    arrays = [np.concatenate(x) for x in zip(*trimmed, strict=True)]
+    arrays[3] = arrays[3] + np.where(count > 0, math.log(OTHER_SCALE_PROBABILITY), 0.0)
+    order = np.argsort(-arrays[3], kind="stable")
+    return Modes(*(np.ascontiguousarray(x[order]) for x in arrays))
+
+
+def _marginal(information: Array, size: int) -> Array:
+    """Information (k, size, size) of the first parameters when the others are unknown, of information (k, d, d)."""
+    A, B, D = information[:, :size, :size], information[:, :size, size:], information[:, size:, size:]
+    return A - B @ np.linalg.solve(D, B.transpose(0, 2, 1)) if D.shape[1] else A
+
+
+def _arrays(graph: ObjectGraph, scale: float) -> tuple[Array, Array, Array, Array, Array]:
+    covariances = np.empty((0, 3, 3)) if graph.covariances is None else graph.covariances * scale
+    arrays = graph.positions, graph.position_variance * scale, covariances, graph.attributes, graph.attribute_variance
     return tuple(np.ascontiguousarray(x) for x in arrays)  # type: ignore[return-value]
 
 
