@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test check setup clean
+.PHONY: demo test test-rllib check setup clean
 
 setup: $(STAMP)
 
@@ -20,6 +20,12 @@ demo: $(STAMP)
 test: $(STAMP)
 	$(BIN)/python -m pytest -n 2 --dist loadfile $(PYTEST_ARGS)
 
+# RLlib wants other versions of Gymnasium than the rest: it has an environment of its own.
+test-rllib:
+	test -x .venv-rllib/bin/python || $(PYTHON) -m venv .venv-rllib
+	.venv-rllib/bin/python -m pip install --quiet --editable '.[envs]' 'ray[rllib]' torch==2.13.0 pytest
+	COVIS_TEST_RLLIB=1 .venv-rllib/bin/python -m pytest tests/rllib
+
 check: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -27,4 +33,4 @@ check: $(STAMP)
 	$(BIN)/lint-imports
 
 clean:
-	rm -rf $(VENV) build *.egg-info covis-demo
+	rm -rf $(VENV) .venv-rllib build *.egg-info covis-demo

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 Row = dict[str, Any]
 
 OURS = "#0072b2"
+OTHERS = ("#e69f00", "#009e73", "#d55e00", "#cc79a7", "#8c564b", "#7f7f7f", "#bcbd22", "#9467bd", "#e377c2", "#444444")
 MARKERS = "osD^vP*Xdph<>8"
 
 
@@ -68,10 +69,12 @@ def scaling_figure(rows: Sequence[Row]) -> Figure:
     Rows hold `what`, `n`, `ours` (solves per second) and, where measured, `memory_mib`.
     """
     methods = list(dict.fromkeys(row["what"] for row in rows))
+    sizes = sorted({row["n"] for row in rows})
     figure, (time, memory) = _figure(2, 5.6, 4.2)
     for k, method in enumerate(methods):
         own = sorted((row for row in rows if row["what"] == method), key=lambda row: row["n"])
         style: dict[str, Any] = {"marker": MARKERS[k % len(MARKERS)], "markersize": 4, "linewidth": 1.1}
+        style["color"] = OTHERS[k % len(OTHERS)]
         if method == "bayes":
             style |= {"color": OURS, "linewidth": 2.4, "zorder": 5}
         time.loglog([row["n"] for row in own], [1e3 / row["ours"] for row in own], label=method, **style)
@@ -81,8 +84,11 @@ def scaling_figure(rows: Sequence[Row]) -> Figure:
     memory.set_ylabel("peak memory above the start, MiB")
     for axis in (time, memory):
         axis.set_xlabel("objects a side")
+        axis.set_xticks(sizes, [str(n) for n in sizes])
+        axis.minorticks_off()
     memory.axhline(1024, color="0.6", linewidth=0.8, linestyle="--")
-    memory.legend(fontsize=7, ncol=2, frameon=False)
+    memory.set_ylim(0.08, 2000)
+    time.legend(fontsize=7, ncol=2, frameon=False)
     return figure
 
 

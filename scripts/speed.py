@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import os
 from importlib import import_module
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.table import Table
 
 from ..evaluation.extras import require
+from ..evaluation.figures import save, scaling_figure
+from ..evaluation.memory_matching import add_memory
 from .console import fail, out, progress_bar, write_rows
 
 AREAS = {
@@ -23,8 +26,11 @@ AREAS = {
 def speed(
     area: Annotated[str, typer.Argument(help=f"{' | '.join(AREAS)}.")],
     json_target: Annotated[str | None, typer.Option("--json", help="Write rows to FILE; - prints them.")] = None,
+    figure: Annotated[Path | None, typer.Option(help="matching: figure of time and memory against size.")] = None,
 ) -> None:
     """Rates per second against peers, side by side in this process, on one thread."""
+    if figure is not None and area != "matching":
+        fail(f"--figure is for matching, not for {area}")
     if area not in AREAS:
         fail(f"no area is called {area!r}; there are {', '.join(AREAS)}")
     module, extra = AREAS[area]
@@ -35,8 +41,13 @@ def speed(
         if extra is not None:
             require(extra)
         measure = import_module(f"covis.evaluation.{module}").rows
+        if figure is not None:
+            require("viz")
         with progress_bar(f"speed {area}") as progress:
             rows = measure(progress)
+        if figure is not None:
+            rows = add_memory(rows)
+            save(scaling_figure(rows), figure)
     except (ValueError, RuntimeError) as error:
         fail(error)
     write_rows(rows, json_target)
