@@ -493,6 +493,10 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         """Rendered frames of the last observation, one per robot, instances by object index. Raises like `snapshot`."""
         return list(self._running("camera_frames()").now.frames)
 
+    def cameras(self) -> tuple[CameraRig, Exposures]:
+        """The rig that takes the pictures, and this episode's exposures, for measuring it alone."""
+        return self._rig, self._running("cameras()").exposures
+
     def _state_size(self) -> int:
         return 13 * self.world.max_objects + self.world.n_robots * (16 + self.world.state_size)
 

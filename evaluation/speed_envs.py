@@ -11,15 +11,19 @@ import numpy as np
 
 from ..agents.controllers import scripted_controls
 from ..envs.camera.comparison import contenders
+from ..envs.camera.raster import PLAIN
 from ..envs.claims import Claims, claims_to_action
 from ..envs.collaborative import CollaborativeEnv
 from ..envs.scenes import SCENES, parallel_env
+from ..envs.scoring import score
 from ..envs.worlds.driving import ConnectedDrivingWorld
 from ..envs.worlds.peers import TinyPeer, speed_params
 from .timing import rates, row
 
 N_ROBOTS = 15
 DRIVING_EPISODES = 8
+SIZES = ((160, 120), (320, 240), (640, 480))
+TEAMS = (15, 30)
 
 
 def rows(progress: Callable[[int, int], None] = lambda done, total: None) -> list[dict[str, Any]]:
@@ -32,12 +36,60 @@ def rows(progress: Callable[[int, int], None] = lambda done, total: None) -> lis
         connected_driving,
         *(partial(reset, scene) for scene in SCENES),
     ]
-    out = []
+    several: list[Callable[[], list[dict[str, Any]]]] = [
+        *(partial(step_parts, "multi_robot", *size, params=speed_params(n)) for size in SIZES for n in TEAMS),
+        *(partial(step_parts, "connected_driving", *size) for size in SIZES),
+    ]
+    out: list[dict[str, Any]] = []
+    total = len(jobs) + len(several)
     for i, job in enumerate(jobs):
-        progress(i, len(jobs))
+        progress(i, total)
         out.append(job())
-    progress(len(jobs), len(jobs))
+    for i, parts in enumerate(several):
+        progress(len(jobs) + i, total)
+        out += parts()
+    progress(total, total)
     return out
+
+
+def step_parts(scene: str, width: int, height: int, params: Any = None) -> list[dict[str, Any]]:
+    """What a step of two robots is made of: rows `part_<scene>_<width>x<height>_<part>`, rates of each part alone.
+
+    `world` moves the simulator and takes the snapshot, `cameras` draws both pictures, `scoring` scores empty claims,
+    `step` is the whole; the rest of it is decoding actions and making observations.
+    """
+    env = parallel_env(scene, params=params, width=width, height=height, max_cycles=10**9)
+    try:
+        env.reset(seed=0)
+        now, claims = env.now(), [Claims.empty(env.max_detections, 1)] * 2
+        controls = np.zeros((2, env.world.control_size))
+        rig, exposures = env.cameras()
+        saved, step = env.save_state(), stepper(env, controls)
+
+        def move() -> None:
+            env.world.step(controls)
+            env.world.snapshot()
+
+        def whole() -> None:
+            if not env.agents:  # a collision ended the episode
+                env.restore_state(saved)
+            step()
+
+        parts: dict[str, Callable[[], object]] = {
+            "cameras": lambda: rig.shoot(now.snapshot, exposures),
+            "scoring": lambda: score(claims, now.truth),
+            "world": move,
+            "step": whole,
+        }
+        out = []
+        for part, job in parts.items():
+            env.restore_state(saved)
+            rate, _ = rates(job, seconds=0.05, rounds=3)
+            what = f"part_{scene}_{width}x{height}_{part}"
+            out.append(row("envs", what, len(now.snapshot.identity), rate, None, None))
+        return out
+    finally:
+        env.close()
 
 
 def camera(width: int, height: int) -> dict[str, Any]:
@@ -53,7 +105,9 @@ def camera(width: int, height: int) -> dict[str, Any]:
 def multi_robot(stock: bool) -> dict[str, Any]:
     """Whole steps with two 160x120 cameras, against the scene as plain pybullet users build it."""
     params = speed_params(N_ROBOTS)
-    env = parallel_env("multi_robot", params=params, width=160, height=120, max_cycles=10**9)
+    # TinyRenderer runs without shadows; where only the renderer differs, ours does too.
+    look = None if stock else PLAIN
+    env = parallel_env("multi_robot", params=params, width=160, height=120, max_cycles=10**9, look=look)
     peer = TinyPeer(2, params, width=160, height=120, stock=stock)
     controls = np.array([[0.2, 0.1], [0.2, -0.1]])
     try:
