@@ -88,7 +88,7 @@ class Tally:
 
     Attributes:
         objects: number of true objects that count.
-        detections: number of detections.
+        detections: number of detections; `true_detections` of them meet a true object, however small.
         right_class: (k,) whether the most probable class is the true one.
         error: (k,) m, estimated minus true distance.
         distance, true_distance: (k,) m.
@@ -101,6 +101,7 @@ class Tally:
 
     objects: int = 0
     detections: int = 0
+    true_detections: int = 0
     images: int = 0
     right_class: list[Array] = field(default_factory=list)
     error: list[Array] = field(default_factory=list)
@@ -260,6 +261,7 @@ def count(out: Tally, image: Image, seen: Seen, score: float) -> None:
     out.objects += int(wanted.sum())
     out.detections += len(sure)
     partner = match_masks(masks[sure], image.instances, image.pixels)
+    out.true_detections += int((partner >= 0).sum())
     hit = (partner >= 0) & (wanted[partner] if len(wanted) else False) & (image.centres[partner, 2] > 0.2)
     found, true = sure[hit], partner[hit]
     if len(found) == 0:
@@ -309,7 +311,7 @@ def row(target: PerceptionTarget, found: Tally) -> dict[str, Any]:
         "objects": found.objects,
         "ap50": found.coco.ap50(),
         "recall": _ratio(len(error), found.objects),
-        "precision": _ratio(len(error), found.detections),
+        "precision": _ratio(found.true_detections, found.detections),
         "class_accuracy": _mean(found.of("right_class")),
         "depth_abs_rel": _mean(np.abs(found.of("depth_ratio") - 1)),
         "depth_bias": _mean(found.of("depth_ratio") - 1),

@@ -63,11 +63,12 @@ def training_notes(state: State, params: TrainingParams) -> dict[str, Any]:
 
 
 def calibrate(tallies: Sequence[Tally]) -> Calibration:
-    """Factors on the variances, and the class temperature, that fit what uncalibrated eyes saw, scenes counting alike.
+    """Factors on depth and variances, and the class temperature, that fit what uncalibrated eyes saw.
 
-    The factor on the depth's variance has the least expected normalised calibration error; that on the centre's makes
-    the median of the squared lateral error that of two Gaussian axes; the temperature has the least negative
-    log-likelihood of the true classes. Scenes with too few detections are left out.
+    Scenes count alike. The factor on the depth makes the median of its logarithmic error zero; that on its variance has
+    the least expected normalised calibration error; that on the centre's makes the median of the squared lateral error
+    that of two Gaussian axes; the temperature has the least negative log-likelihood of the true classes. Scenes with
+    too few detections are left out.
     """
     from ..agents.perception.weights import Calibration
 
@@ -75,11 +76,15 @@ def calibrate(tallies: Sequence[Tally]) -> Calibration:
     if not used:
         return Calibration()
     factors = np.exp(np.linspace(np.log(0.05), np.log(20), 121))
-    errors = [np.mean([ence(f * t.of("u"), t.of("error") ** 2) or 0.0 for t in used]) for f in factors]
+    scale = float(np.exp(-np.mean([np.median(np.log(t.of("depth_ratio"))) for t in used])))
+    squared = [(scale * t.of("distance") - t.of("true_distance")) ** 2 for t in used]
+    reported = [scale**2 * t.of("u") for t in used]
+    errors = [np.mean([ence(f * u, e) or 0.0 for u, e in zip(reported, squared, strict=True)]) for f in factors]
     lateral = [np.median(t.of("lateral") ** 2 / t.of("across")) / MEDIAN_CHI_SQUARED_2 for t in used]
     temperatures = np.exp(np.linspace(np.log(0.3), np.log(3), 61))
     surprise = [np.mean([_negative_log_likelihood(t, x) for t in used]) for x in temperatures]
     return Calibration(
+        scale=scale,
         depth=float(factors[int(np.argmin(errors))]),
         centre=float(np.exp(np.mean(np.log(lateral)))),
         class_temperature=float(temperatures[int(np.argmin(surprise))]),

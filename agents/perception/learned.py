@@ -241,7 +241,8 @@ class LearnedPerception:
         box = found.boxes[:, None].expand(n, D, 4).reshape(-1, 4)
         seen = depth_features(dense, geometry, image, pixels.reshape(-1, 2), box)
         log_depth, log_variance = self.network.depth(seen, T > 1, generator, draws=T)
-        z = torch.exp(log_depth.double().view(T, n, D)) * float(geometry.focal[0]) / REFERENCE_FOCAL_PX
+        unit = self.calibration.scale * float(geometry.focal[0]) / REFERENCE_FOCAL_PX
+        z = unit * torch.exp(log_depth.double().view(T, n, D))
         aleatoric = (z**2 * torch.exp(log_variance.double().view(T, n, D))).mean(0)
         epistemic = z.var(0, unbiased=False)
         factor = self.calibration.depth

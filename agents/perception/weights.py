@@ -25,14 +25,16 @@ class WeightsError(RuntimeError):
 
 @dataclass(frozen=True)
 class Calibration:
-    """Factors, found on validation seeds, that make the reported uncertainty true.
+    """Factors, found on validation seeds, that make depths unbiased and the reported uncertainty true.
 
     Attributes:
+        scale: on the depth itself.
         depth: on the variance of the depth.
         centre: on the variance of the projected centre.
         class_temperature: logits are divided by it.
     """
 
+    scale: float = 1.0
     depth: float = 1.0
     centre: float = 1.0
     class_temperature: float = 1.0

@@ -328,7 +328,7 @@ def test_an_image_without_objects_gives_an_empty_graph():
 
 
 def test_weights_come_back_as_they_were_saved(tmp_path):
-    saved = replace(tiny_weights(), calibration=stored.Calibration(2.0, 3.0, 1.5), notes={"minutes": 1})
+    saved = replace(tiny_weights(), calibration=stored.Calibration(1.1, 2.0, 3.0, 1.5), notes={"minutes": 1})
     stored.save(saved, tmp_path)
     loaded = stored.load(tmp_path)
     assert loaded.classes == CLASSES

@@ -75,12 +75,13 @@ def gaussian_tally(scale: float, n: int = 4000, seed: int = 0) -> Tally:
     lateral = np.linalg.norm(rng.normal(size=(n, 2)) * np.sqrt(4 * across)[:, None], axis=1)
     p = rng.dirichlet([1, 1, 1], n)
     true = np.array([rng.choice(3, p=q) for q in p])
-    distance = rng.uniform(2, 20, n)
+    distance = rng.uniform(5, 20, n)
+    error = np.sqrt(scale * u) * rng.standard_normal(n)
     return Tally(
         objects=n,
         detections=n,
         images=n,
-        error=[np.sqrt(scale * u) * rng.standard_normal(n)],
+        error=[error],
         u=[u],
         v=[np.full(n, 0.1)],
         across=[across],
@@ -89,7 +90,7 @@ def gaussian_tally(scale: float, n: int = 4000, seed: int = 0) -> Tally:
         true_class=[true],
         right_class=[p.argmax(1) == true],
         distance=[distance],
-        true_distance=[distance],
+        true_distance=[distance - error],
         depth_ratio=[np.ones(n)],
         size=[rng.uniform(60, 600, n)],
     )
@@ -109,6 +110,16 @@ def test_calibration_recovers_the_factors():
     assert found.class_temperature == pytest.approx(1, rel=0.1)
 
 
+def test_calibration_undoes_a_bias_of_scale():
+    biased = gaussian_tally(1)
+    biased.distance = [1.1 * d for d in biased.distance]
+    biased.depth_ratio = [1.1 * r for r in biased.depth_ratio]
+    biased.u = [1.21 * u for u in biased.u]
+    found = calibrate([biased])
+    assert found.scale == pytest.approx(1 / 1.1)
+    assert found.depth == pytest.approx(1, rel=0.15)
+
+
 def test_calibration_without_detections_changes_nothing():
     assert calibrate([Tally()]).depth == 1
 
@@ -123,6 +134,8 @@ def test_spearman_of_orders():
 
 def test_shift_compares_like_with_like():
     known, strange = gaussian_tally(1), gaussian_tally(1, seed=5)
+    for found in (known, strange):
+        found.true_distance = found.distance
     far = strange.of("true_distance") > 10
     strange.u = [np.where(far, 50.0, 2 * strange.of("u"))]
     strange.true_distance = [np.where(far, 500.0, strange.of("true_distance"))]  # no such objects are known
@@ -180,6 +193,7 @@ def test_counting_one_image():
     assert figures["depth_abs_rel"] == pytest.approx(0.125)
     assert figures["ap50"] == pytest.approx(1)
     assert figures["recall"] == 1
+    assert figures["precision"] == 1
 
 
 def test_untrained_eyes_give_rows_for_a_known_and_a_held_out_target():
