@@ -17,7 +17,7 @@ from .bayes_view import View
 from .graph import DEFAULT_BEARING_STD_RAD, Hypothesis, Matching, ObjectGraph, check_comparable
 from .pose import Array, RelativePose
 
-HALF_RANGE_QUANTILE = 0.75
+HALF_RANGE_QUANTILE = 0.65
 OCCLUDER = 0.022
 OCCLUDED = 0.75
 POSE_CONCENTRATION = 1.8
@@ -45,7 +45,7 @@ def bayes(
     mislabel: float = 0.01,
     extent: float = 0.018,
     depth_offset: float = 0.035,
-    depth_offset_std: float = 0.03,
+    depth_offset_std: float = 0.015,
     scale_std: float = 0.0,
     detection: float = 0.9,
     screened: int = 300,
