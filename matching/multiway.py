@@ -1,10 +1,9 @@
 """Pairwise matchings of N robots made consistent: what a matches with b, and b with c, a matches with c.
 
-`joint`, the default, optimises all groups together under every robot's one-to-one constraint. Like Hu, Huang, Thibert and
-Guibas 2018 (distributable consistent multi-object matching) it matches detections to a common universe of objects, robot
-by robot; it is a combinatorial ascent, not their convex relaxation. `spectral` is the reference
-(after Pachauri, Kondor and Singh 2013, and Maset, Arrigoni and Fusiello 2017): leading eigenvectors of the joint match
-matrix, grouped.
+`joint`, the default, optimises all groups together under every robot's one-to-one constraint. Like Hu, Huang, Thibert
+and Guibas 2018 (distributable consistent multi-object matching) it matches detections to a common universe of objects,
+robot by robot; it is a combinatorial ascent, not their convex relaxation. `spectral` is the reference (after Pachauri,
+Kondor and Singh 2013, and Maset, Arrigoni and Fusiello 2017): leading eigenvectors of the joint match matrix, grouped.
 """
 
 from __future__ import annotations
