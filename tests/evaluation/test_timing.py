@@ -1,0 +1,42 @@
+"""Rates, rows and memory; no number here depends on how fast the machine is."""
+
+import time
+
+import pytest
+
+from covis.evaluation.memory_matching import STATUS, peak_mib
+from covis.evaluation.timing import rates, row
+
+
+def test_both_jobs_run_in_turn_and_equally_often():
+    calls = []
+    ours, peer = rates(lambda: calls.append("a"), lambda: calls.append("b"), seconds=1e-9, rounds=4)
+    assert ours > 0
+    assert peer > 0
+    assert "".join(calls[-8:]) == "abababab"
+
+
+def test_a_sleeping_job_has_its_rate():
+    ours, peer = rates(lambda: time.sleep(0.01), seconds=0.01, rounds=2)
+    assert 10 < ours <= 100
+    assert peer is None
+
+
+def test_rows_have_ratios_only_with_a_peer():
+    assert row("envs", "x", 3, 10.0, "other", 2.0)["ratio"] == 5.0
+    assert row("envs", "x", None, 10.0, None, None)["ratio"] is None
+
+
+@pytest.mark.skipif(not STATUS.exists(), reason="the operating system does not tell a process's peak memory")
+def test_a_quadratic_affinity_shows_in_memory():
+    assert peak_mib("rrwm", 40) > peak_mib("reid", 40) + 5
+
+
+def test_speed_refuses_unknown_areas():
+    from typer.testing import CliRunner
+
+    from covis.scripts.main import app
+
+    result = CliRunner().invoke(app, ["speed", "light"])
+    assert result.exit_code == 2
+    assert "no area is called 'light'" in result.stderr
