@@ -19,12 +19,12 @@ UP = np.array([0.0, 0.0, 1.0])
 
 def rows(progress: Callable[[int, int], None] = lambda done, total: None) -> list[dict[str, Any]]:
     """`fuse_8x50`: 8 robots, 50 objects each; `sequence_loop`: match, fuse, track, two robots of 15 objects."""
-    out = []
-    for i, job in enumerate((fuse_many, sequence_loop)):
-        progress(i, 2)
-        out.append(job())
+    progress(0, 2)
+    fused = fuse_many()
+    progress(1, 2)
+    loop = sequence_loop()
     progress(2, 2)
-    return out
+    return [fused, loop]
 
 
 def fuse_many(robots: int = 8, objects: int = 50) -> dict[str, Any]:
