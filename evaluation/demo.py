@@ -15,6 +15,7 @@ from .settings import SCENE_NAMES, Settings
 
 METHODS = ("random", "reid", "rgm", "bayes", "oracle")
 EPISODES = 2
+PRESET = "easy"
 COLUMNS = (
     ("method", "method"),
     ("precision", "precision"),
@@ -38,7 +39,7 @@ def demo(
     from .gallery import Picture, correspondence_pictures
 
     methods = [Method.parse(name) for name in METHODS]
-    settings = Settings(seed=seed, episodes=EPISODES)
+    settings = Settings(preset=PRESET, seed=seed, episodes=EPISODES)
     n_scenes = len(SCENE_NAMES)
     rows = benchmark(SCENE_NAMES, methods, settings, progress=lambda done, total: progress(done, total + n_scenes))
     pictures: dict[str, list[Picture]] = {}
@@ -54,7 +55,7 @@ def _report(rows: Sequence[dict[str, Any]], pictures: dict[str, list[Any]], out:
     lines = [
         "# covis demo",
         "",
-        f"Seed {seed}, {EPISODES} episodes a scene, simulated perception, poses unknown to the matchers.",
+        f"Seed {seed}, {EPISODES} episodes a scene, preset {PRESET}, simulated perception, poses unknown to the matchers.",
         "Green lines are right matches, dashed red ones wrong; grey boxes are detections left unmatched.",
     ]
     for scene, shown in pictures.items():
