@@ -48,7 +48,7 @@ class LearnedPerceptionParams:
     """
 
     samples: int = 16
-    score: float = 0.3
+    score: float = 0.5
     candidates: int = 64
     min_pixels: int = 40
     depth_pixels: int = 12
