@@ -55,7 +55,7 @@ def _report(rows: Sequence[dict[str, Any]], pictures: dict[str, list[Any]], out:
     lines = [
         "# covis demo",
         "",
-        f"Seed {seed}, {EPISODES} episodes a scene, preset {PRESET}, simulated perception, poses unknown to the matchers.",
+        f"Seed {seed}, preset {PRESET}, {EPISODES} episodes a scene, simulated perception, poses unknown to matchers.",
         "Green lines are right matches, dashed red ones wrong; grey boxes are detections left unmatched.",
     ]
     for scene, shown in pictures.items():
