@@ -170,7 +170,7 @@ def test_bootstrap_resamples_episodes_not_pairs():
 
 @pytest.mark.slow
 def test_gated_assignment_on_development_data(shared_data):
-    """A 7 m gate reaches F1 .88 on carla-v2v with noisy poses (FINDINGS)."""
+    """A 7 m gate reaches F1 .88 on carla-v2v with noisy poses."""
     (row,) = benchmark(
         [str(shared_data / "carla-v2v")], [Method.parse("hungarian")], Settings(pose="known", episodes=6)
     )
