@@ -13,7 +13,7 @@ import numpy as np
 
 from .bayes_prepare import LOG_2PI, Problem, Settings, levelling_rotation, prepare, ranges
 from .bayes_solve import Modes, Prior, decode, mix, solve_levelled, solve_spatial
-from .bayes_view import View
+from .bayes_view import View, sector_evidence
 from .graph import DEFAULT_BEARING_STD_RAD, Hypothesis, Matching, ObjectGraph, check_comparable
 from .pose import Array, RelativePose
 
@@ -111,7 +111,12 @@ def bayes(
             q._replace(scale_std=depth_scale_std),
         )
         solve = solve_levelled if gravity else solve_spatial
-        return solve(problem, _pose_prior(prior, problem, L_a, L_b, gravity), view_a, view_b, q, screened, refined)
+        pose_prior = _pose_prior(prior, problem, L_a, L_b, gravity)
+        found = solve(problem, pose_prior, view_a, view_b, q, screened, refined)
+        if prior is not None or not gravity or view_a.known > 0:
+            return found
+        alone = sector_evidence(problem.p_a, problem.p_b, found.R, found.t, found.marginals)
+        return found._replace(log_evidence=found.log_evidence + alone)
 
     modes = explain(1.0, scale_std)
     if rescale and modes.log_evidence.max(initial=-math.inf) < DOUBTFUL:

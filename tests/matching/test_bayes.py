@@ -10,6 +10,13 @@ import pytest
 from covis.matching import ObjectGraph, RelativePose, bayes
 from covis.matching.bayes_assignment import assignment_marginals
 from covis.matching.bayes_prepare import class_evidence, height_correction, levelling_rotation
+from covis.matching.bayes_view import (
+    SECTOR_COST,
+    SECTOR_MARGIN_RAD,
+    SECTOR_REACH,
+    SECTOR_SHARE,
+    sector_evidence,
+)
 from covis.matching.metrics import count, expected_calibration_error, is_correct, pooled
 from covis.matching.pose import invert
 
@@ -325,3 +332,31 @@ def test_wrong_variances_and_a_wrong_depth_scale_are_noticed(factor, scale):
         rescaled.append(count(bayes(a, b), ia, ib))
     assert pooled(rescaled).f1 > pooled(plain).f1 - (0.02 if factor > 1 else 0.0)
     assert pooled(rescaled).f1 > 0.7
+
+
+def test_alone_in_the_sector_of_the_other_robot_speaks_against_a_pose():
+    rng = np.random.default_rng(5)
+    n, m = 6, 5
+    p_a, p_b = rng.uniform(-10, 10, (n + 1, 3)), rng.uniform(1, 10, (m + 1, 3))
+    p_a[-1] = p_b[-1] = 0.0
+    yaw = np.array([0.3, -2.0, 1.2])
+    R = np.array([[[np.cos(w), -np.sin(w), 0], [np.sin(w), np.cos(w), 0], [0, 0, 1]] for w in yaw])
+    t = rng.uniform(-8, 8, (3, 3))
+    marginals = rng.uniform(0, 1 / n, (3, n, m))
+
+    def inside(x, p):
+        ray = p[:-1, 0] + 1j * p[:-1, 1]
+        middle = (ray / abs(ray)).sum()
+        half = abs(np.angle(ray / middle)).max() + SECTOR_MARGIN_RAD
+        z = x[:, 0] + 1j * x[:, 1]
+        return (abs(np.angle(z / middle)) < half) & (abs(z) < SECTOR_REACH * abs(ray).max())
+
+    expected = []
+    for k in range(3):
+        in_b, in_a = inside((p_a[:-1] - t[k]) @ R[k], p_b), inside(p_b[:-1] @ R[k].T + t[k], p_a)
+        alone_a, alone_b = 1 - marginals[k].sum(axis=1), 1 - marginals[k].sum(axis=0)
+        expected.append(
+            SECTOR_COST * (((SECTOR_SHARE - in_b) * alone_a).sum() + ((SECTOR_SHARE - in_a) * alone_b).sum())
+        )
+    assert np.ptp(expected) > 0.1
+    np.testing.assert_allclose(sector_evidence(p_a, p_b, R, t, marginals), expected, atol=1e-12)
