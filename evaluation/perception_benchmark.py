@@ -149,7 +149,7 @@ def perception_benchmark(
     require("envs")
     require("learned")
     if find_spec("pycocotools") is None:
-        raise MissingExtraError("pycocotools is missing: install covis[perception]")
+        raise MissingExtraError("pycocotools is missing: install covis[learned]")
     from ..agents.perception import weights as stored
     from ..agents.perception.frames import TEST_KEY
 
