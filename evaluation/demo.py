@@ -56,7 +56,7 @@ def _report(rows: Sequence[dict[str, Any]], pictures: dict[str, list[Any]], out:
         "# covis demo",
         "",
         f"Seed {seed}, preset {PRESET}, {EPISODES} episodes a scene, simulated perception, poses unknown to matchers.",
-        "Green lines are right matches, dashed red ones wrong; grey boxes are detections left unmatched.",
+        "Green lines are right matches, dashed red ones wrong; white corners are detections left unmatched.",
     ]
     for scene, shown in pictures.items():
         lines += ["", f"## {scene}", "", "| " + " | ".join(title for _, title in COLUMNS) + " |"]
