@@ -6,7 +6,7 @@ the Intelligent Driver Model, steering, the bicycle model, the closest lane, col
 decisions (routes, lane changes, who yields) run highway-env's own code. `stock_twin` copies a road into highway-env's
 own classes; the tests drive both side by side. Traffic amplifies a difference in the last bit, so wherever such a
 difference would reach a vehicle's motion the transcendental functions are NumPy's, as in highway-env, and not the
-compiler's.
+compiler's. Sums of two products remain: BLAS, which highway-env calls for them, rounds them once on CPUs with AVX-512.
 
 Everything here is in highway-env's frame (x right, y down on its screen).
 """
