@@ -15,10 +15,16 @@ from functools import lru_cache
 from multiprocessing import get_context
 from pathlib import Path
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 
+from .dataset_pages import with_images
 from .datasets import Dataset, load_dataset
 from .methods import Method
+from .pictures import Page, PictureBook
+from .pictures import to_table as pictures_table
+from .provenance import FILE as PROVENANCE
+from .provenance import with_session
 from .records import Record, from_table, to_table
 from .run_dataset import run_episodes
 from .settings import Settings
@@ -64,13 +70,27 @@ def scene_units(scene: str, settings: Settings) -> list[Unit]:
     ]
 
 
-def run_unit(unit: Unit, methods: Sequence[Method], settings: Settings) -> list[Record]:
+@dataclass(frozen=True)
+class UnitResult:
+    """What a unit leaves behind: its records, and some frames for the report (none unless asked for)."""
+
+    records: list[Record]
+    pages: list[Page]
+
+
+def run_unit(unit: Unit, methods: Sequence[Method], settings: Settings, pictures: bool = False) -> UnitResult:
+    """Records of a unit; with `pictures` also the frames that a report shows."""
     if unit.kind == "dataset":
-        return run_episodes(_dataset(unit.target, settings.seed), unit.episodes, methods, settings)
+        dataset = _dataset(unit.target, settings.seed)
+        book = PictureBook(int(dataset.episode[0])) if pictures else None
+        records = run_episodes(dataset, unit.episodes, methods, settings, book)
+        return UnitResult(records, [] if book is None else with_images(dataset, book.pages()))
     # Imported here: matching on dataset folders runs without the simulators.
     from . import run_scene
 
-    return run_scene.run_episodes(unit.target, unit.episodes, methods, settings)
+    book = PictureBook(0) if pictures else None
+    records = run_scene.run_episodes(unit.target, unit.episodes, methods, settings, book)
+    return UnitResult(records, [] if book is None else book.pages())
 
 
 def run(
@@ -102,24 +122,29 @@ def run(
     results: dict[int, list[Record]] = {} if shards is None else shards.finished()
     progress(len(results), len(units))
     todo = [i for i in range(len(units)) if i not in results]
-    for number, records in _execute(todo, units, methods, settings, workers):
+    for number, result in _execute(todo, units, methods, settings, workers, pictures=shards is not None):
         if shards is not None:
-            shards.write(number, records)
-        results[number] = records
+            shards.write(number, result)
+        results[number] = result.records
         progress(len(results), len(units))
     return [record for number in sorted(results) for record in results[number]]
 
 
 def _execute(
-    todo: Sequence[int], units: Sequence[Unit], methods: Sequence[Method], settings: Settings, workers: int
-) -> Iterator[tuple[int, list[Record]]]:
+    todo: Sequence[int],
+    units: Sequence[Unit],
+    methods: Sequence[Method],
+    settings: Settings,
+    workers: int,
+    pictures: bool,
+) -> Iterator[tuple[int, UnitResult]]:
     if workers == 1:
         for i in todo:
-            yield i, run_unit(units[i], methods, settings)
+            yield i, run_unit(units[i], methods, settings, pictures)
         return
     # Spawned, not forked: Numba's and pybullet's state does not survive a fork.
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        futures = {pool.submit(run_unit, units[i], methods, settings): i for i in todo}
+        futures = {pool.submit(run_unit, units[i], methods, settings, pictures): i for i in todo}
         try:
             for future in as_completed(futures):
                 yield futures[future], future.result()
@@ -154,19 +179,29 @@ class Shards:
             if not resume:
                 raise FileExistsError(f"{out} holds this run already; give --resume to go on with it")
         folder.mkdir(parents=True, exist_ok=True)
+        (out / "pictures").mkdir(exist_ok=True)
+        sessions = out / PROVENANCE
+        earlier = sessions.read_text() if file.exists() and sessions.exists() else None
+        write_atomically(sessions, with_session(earlier, settings))
         write_atomically(file, json.dumps(config, indent=1).encode())
         return cls(folder, len(units))
 
     def finished(self) -> dict[int, list[Record]]:
         return {i: from_table(pq.read_table(self._file(i))) for i in range(self.n) if self._file(i).exists()}
 
-    def write(self, number: int, records: Sequence[Record]) -> None:
-        temporary = self._file(number).with_suffix(f".{os.getpid()}.tmp")
-        pq.write_table(to_table(records), temporary)
-        os.replace(temporary, self._file(number))
+    def write(self, number: int, result: UnitResult) -> None:
+        """The records last: a unit whose records are there is finished."""
+        _write_table(pictures_table(result.pages), self.folder.parent / "pictures" / self._file(number).name)
+        _write_table(to_table(result.records), self._file(number))
 
     def _file(self, number: int) -> Path:
         return self.folder / f"unit-{number:05d}.parquet"
+
+
+def _write_table(table: pa.Table, file: Path) -> None:
+    temporary = file.with_suffix(f".{os.getpid()}.tmp")
+    pq.write_table(table, temporary)
+    os.replace(temporary, file)
 
 
 def write_atomically(file: Path, content: bytes) -> None:

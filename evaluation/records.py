@@ -30,6 +30,11 @@ SCHEMA = pa.schema(
         ("hits", pa.list_(pa.bool_())),
         ("error_single_m", pa.list_(pa.float64())),
         ("error_fused_m", pa.list_(pa.float64())),
+        ("error_range_m", pa.list_(pa.float64())),
+        ("error_occlusion", pa.list_(pa.float64())),
+        ("common_range_m", pa.list_(pa.float64())),
+        ("common_occlusion", pa.list_(pa.float64())),
+        ("common_found", pa.list_(pa.bool_())),
     ]
 )
 
@@ -39,7 +44,10 @@ class Record:
     """One pair of views matched by one method.
 
     `visible` counts objects that both cameras could see (None on datasets, which do not know); `scores` and `hits` run
-    over the emitted matches; the errors (m) over objects both localised, where positions are scored.
+    over the emitted matches; the errors (m) over objects both localised, where positions are scored, each with the
+    object's distance from the robot that errs and how much of it is hidden there (0 to 1). `common_...` runs over the
+    objects both detected: the larger distance, the larger occlusion, and whether they were matched rightly; the
+    occlusion is empty on datasets, which do not know it.
     """
 
     target: str
@@ -57,6 +65,11 @@ class Record:
     visible: int | None = None
     error_single_m: list[float] = field(default_factory=list)
     error_fused_m: list[float] = field(default_factory=list)
+    error_range_m: list[float] = field(default_factory=list)
+    error_occlusion: list[float] = field(default_factory=list)
+    common_range_m: list[float] = field(default_factory=list)
+    common_occlusion: list[float] = field(default_factory=list)
+    common_found: list[bool] = field(default_factory=list)
 
     @classmethod
     def of_matching(

@@ -3,33 +3,51 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from itertools import combinations
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ..matching import Matching
+from ..matching.metrics import Counts, is_correct
+from .dataset_pages import page
 from .datasets import Dataset, Frame, View, prior_between
 from .matching_run import match_pair
 from .methods import Method
+from .pictures import PictureBook
 from .records import Record
 from .sequence import PairTrackers
 from .settings import MIN_DETECTIONS, Settings
 
 
 def run_episodes(
-    dataset: Dataset, episodes: Sequence[int], methods: Sequence[Method], settings: Settings
+    dataset: Dataset,
+    episodes: Sequence[int],
+    methods: Sequence[Method],
+    settings: Settings,
+    book: PictureBook | None = None,
 ) -> list[Record]:
-    """Records of the given episodes, in order of time, pair and method."""
+    """Records of the given episodes, in order of time, pair and method; `book` gets to see every frame."""
     records: list[Record] = []
     trackers = PairTrackers() if settings.sequence else None
     for i in np.flatnonzero(np.isin(dataset.episode, np.asarray(episodes))):
         frame = dataset.frame(int(i))
         if trackers is not None:
             trackers.begin(frame.episode, {view.robot: view.odometry for view in frame.views})
+        found: list[tuple[Record, NDArray[np.int64]]] = []
         for pair in pairs(frame, 0 if trackers is not None else settings.min_common):
-            found = list(_match_all(dataset, pair, methods, settings, trackers))
+            matched = list(_match_all(dataset, pair, methods, settings, trackers))
             # A tracker sees every frame; which of them are scored is another matter.
             if n_common(pair[1], pair[2]) >= settings.min_common:
-                records += found
+                found += matched
+        records += [record for record, _ in found]
+        if book is not None and found:
+            counts: dict[str, Counts] = {}
+            for record, _ in found:
+                counts[record.method] = counts.get(record.method, Counts()) + record.counts
+            book.see(frame.episode, counts, partial(page, dataset, frame, found))
     return records
 
 
@@ -53,7 +71,8 @@ def _match_all(
     methods: Sequence[Method],
     settings: Settings,
     trackers: PairTrackers | None,
-) -> Iterator[Record]:
+) -> Iterator[tuple[Record, NDArray[np.int64]]]:
+    """The record of each method, and its matched pairs (k, 2)."""
     frame, source, target = pair
     prior = prior_between(source, target) if settings.pose == "known" else None
     where = f"{dataset.name}, frame {frame.index}, {source.robot} and {target.robot}"
@@ -69,7 +88,7 @@ def _match_all(
             where,
             None if trackers is None else trackers.of(method.label, source.robot, target.robot),
         )
-        yield Record.of_matching(
+        record = Record.of_matching(
             matching,
             source.identity,
             target.identity,
@@ -80,4 +99,18 @@ def _match_all(
             frame=frame.index,
             source=source.robot,
             partner=target.robot,
+            **_common(source, target, matching),
         )
+        yield record, matching.pairs
+
+
+def _common(source: View, target: View, matching: Matching) -> dict[str, list[Any]]:
+    """Of the objects both detected: the larger of the two distances, and whether they were matched rightly."""
+    shared, i, j = np.intersect1d(source.identity, target.identity, return_indices=True)
+    real = shared >= 0
+    distance = np.maximum(
+        np.linalg.norm(source.graph.positions[i[real]], axis=1), np.linalg.norm(target.graph.positions[j[real]], axis=1)
+    )
+    right = matching.pairs[is_correct(matching, source.identity, target.identity), 0]
+    found = np.isin(shared[real], source.identity[right])
+    return {"common_range_m": distance.tolist(), "common_found": found.tolist()}

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 from typing import Any
 
@@ -17,12 +18,15 @@ from numpy.typing import NDArray
 from ..agents.controllers import scripted_controls
 from ..agents.localizer import Matchings, View, claims, look, relative_pose
 from ..agents.perception import Perceptor, make_perceptor
+from ..agents.perception.simulated import OCCLUSION, measure
 from ..envs.claims import Claims, claims_to_action
 from ..envs.collaborative import CollaborativeEnv
 from ..envs.scenes import parallel_env
-from ..envs.scoring import PairScore, StepScore, score, tie
+from ..envs.scoring import PairScore, StepScore, Truth, score, tie
+from ..matching.pose import transform
 from .matching_run import match_pair
 from .methods import Method
+from .pictures import Page, PictureBook, Result, Sight, jpeg, rounded
 from .records import Record
 from .sequence import PairTrackers
 from .settings import MIN_DETECTIONS, Settings, scene_preset
@@ -30,7 +34,10 @@ from .settings import MIN_DETECTIONS, Settings, scene_preset
 
 @dataclass(frozen=True, eq=False)
 class SceneFrame:
-    """One instant of a scene: what the robots brought, and what each method made of it."""
+    """One instant of a scene: what the robots brought, what each method made of it, and what is true.
+
+    `occlusion` (N, m) is the share of each object's outline in each image that something nearer or the edge cuts off.
+    """
 
     episode: int
     step: int
@@ -39,19 +46,29 @@ class SceneFrame:
     match_ms: dict[str, dict[tuple[int, int], float]]
     claims: dict[str, list[Claims]]
     scores: dict[str, StepScore]
+    truth: Truth
+    occlusion: NDArray[np.float64]
 
 
-def run_episodes(scene: str, episodes: Sequence[int], methods: Sequence[Method], settings: Settings) -> list[Record]:
-    """Records of the given episodes, in order of time, pair and method."""
+def run_episodes(
+    scene: str,
+    episodes: Sequence[int],
+    methods: Sequence[Method],
+    settings: Settings,
+    book: PictureBook | None = None,
+) -> list[Record]:
+    """Records of the given episodes, in order of time, pair and method; `book` gets to see every frame."""
     env = make_env(scene, settings)
+    found: list[Record] = []
     try:
-        return [
-            record
-            for episode in episodes
-            for frame in play(env, episode, methods, settings)
-            for method in methods
-            for record in records(scene, frame, method)
-        ]
+        for episode in episodes:
+            for frame in play(env, episode, methods, settings):
+                for method in methods:
+                    found += records(scene, frame, method)
+                if book is not None:
+                    counts = {label: result.counts for label, result in frame.scores.items()}
+                    book.see(episode, counts, partial(page, scene, env, frame))
+        return found
     finally:
         env.close()
 
@@ -107,7 +124,7 @@ def _match_frame(
 ) -> SceneFrame:
     truth = env.ground_truth()
     identities = [identity(view, i, env) for i, view in enumerate(views)]
-    frame = SceneFrame(episode, step, views, {}, {}, {}, {})
+    frame = SceneFrame(episode, step, views, {}, {}, {}, {}, truth, occlusion(env))
     for method in methods:
         found: Matchings = {}
         elapsed: dict[tuple[int, int], float] = {}
@@ -143,10 +160,12 @@ def records(scene: str, frame: SceneFrame, method: Method) -> Iterator[Record]:
     """One record per pair of robots that was matched."""
     result = frame.scores[method.label]
     given: set[tuple[int, int]] = set()
+    distance = np.linalg.norm(frame.truth.positions - frame.truth.T_world_camera[:, None, :3, 3], axis=2)
     for pair in result.pairs:
         if (pair.a, pair.b) not in frame.matchings[method.label]:
             continue
-        single, fused = _errors(pair, result, given)
+        slots = _scored_slots(pair, given)
+        common = _common(pair, result)
         yield Record(
             target=scene,
             method=method.label,
@@ -161,18 +180,75 @@ def records(scene: str, frame: SceneFrame, method: Method) -> Iterator[Record]:
             match_ms=frame.match_ms[method.label][pair.a, pair.b],
             scores=pair.scores.tolist(),
             hits=pair.hits.tolist(),
-            error_single_m=single,
-            error_fused_m=fused,
+            error_single_m=[float(result.error_single[slot]) for slot in slots],
+            error_fused_m=[float(result.error_fused[slot]) for slot in slots],
+            error_range_m=[float(distance[robot, result.tied[robot, k]]) for robot, k in slots],
+            error_occlusion=[float(frame.occlusion[robot, result.tied[robot, k]]) for robot, k in slots],
+            common_range_m=distance[[pair.a, pair.b]][:, common].max(axis=0).tolist(),
+            common_occlusion=frame.occlusion[[pair.a, pair.b]][:, common].max(axis=0).tolist(),
+            common_found=np.isin(common, result.tied[pair.a, pair.assertions[pair.hits, 0]]).tolist(),
         )
 
 
-def _errors(pair: PairScore, result: StepScore, given: set[tuple[int, int]]) -> tuple[list[float], list[float]]:
-    """Displacement errors of the pair's right matches; a slot that several pairs match counts with the first alone."""
-    single, fused = [], []
-    for slots in pair.assertions[pair.hits].tolist():
-        for key in zip((pair.a, pair.b), slots, strict=True):
+def _scored_slots(pair: PairScore, given: set[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Robot and slot of the pair's right matches; a slot that several pairs match counts with the first alone."""
+    slots = []
+    for match in pair.assertions[pair.hits].tolist():
+        for key in zip((pair.a, pair.b), match, strict=True):
             if key not in given:
                 given.add(key)
-                single.append(float(result.error_single[key]))
-                fused.append(float(result.error_fused[key]))
-    return single, fused
+                slots.append(key)
+    return slots
+
+
+def _common(pair: PairScore, result: StepScore) -> NDArray[np.int64]:
+    """Objects (c,) that both robots of the pair detected."""
+    common = np.intersect1d(result.tied[pair.a], result.tied[pair.b])
+    return common[common >= 0]
+
+
+def occlusion(env: CollaborativeEnv) -> NDArray[np.float64]:
+    """Hidden share (N, m) of each object's outline in each robot's present image, as the simulated eyes define it."""
+    m = len(env.ground_truth().identity)
+    # The cameras count objects from 0, `measure` counts the background as 0.
+    seen = [measure(camera.instances + np.int32(1), camera.depth, m + 1) for camera in env.camera_frames()]
+    return np.stack([row[1:, OCCLUSION] for row in seen])
+
+
+def page(scene: str, env: CollaborativeEnv, frame: SceneFrame) -> Page:
+    """The frame for the report; the environment still stands at its instant."""
+    place = dict(zip(frame.truth.identity.tolist(), frame.truth.positions.tolist(), strict=True))
+    sights, poses = [], frame.truth.T_world_camera
+    for i, (view, camera) in enumerate(zip(frame.views, env.camera_frames(), strict=True)):
+        identities = identity(view, i, env)
+        sights.append(
+            Sight(
+                robot=env.possible_agents[i],
+                image=jpeg(camera.rgb),
+                pose=rounded(poses[i].ravel()),
+                boxes=rounded(view.detections.boxes),
+                places=rounded(transform(poses[i], view.detections.graph.positions)),
+                identity=identities.tolist(),
+                truth=[place.get(int(k)) for k in identities],
+            )
+        )
+    size = [env.width, env.height]
+    results = [_result(label, frame) for label in frame.scores]
+    return Page(scene, frame.episode, frame.step, "episode", size, sights, results)
+
+
+def _result(label: str, frame: SceneFrame) -> Result:
+    score, said = frame.scores[label], frame.claims[label]
+    poses = frame.truth.T_world_camera
+    return Result(
+        method=label,
+        robots=[[p.a, p.b] for p in score.pairs for _ in p.hits],
+        pairs=[slots for p in score.pairs for slots in p.assertions.tolist()],
+        scores=[float(s) for p in score.pairs for s in p.scores],
+        hits=[bool(h) for p in score.pairs for h in p.hits],
+        common=score.counts.common,
+        fused=[
+            rounded(transform(poses[i], said[i].positions[: len(view.detections)]))
+            for i, view in enumerate(frame.views)
+        ],
+    )

@@ -1,0 +1,100 @@
+"""Frames of a dataset folder for the report: what its tables hold, images and boxes where there are any."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+
+from ..matching.pose import transform
+from .datasets import Dataset, Frame, View
+from .pictures import Page, Result, Sight, recompressed, rounded
+from .records import Record
+
+
+def page(dataset: Dataset, frame: Frame, found: Sequence[tuple[Record, np.ndarray]]) -> Page:
+    """A frame without images; `found` holds every record of the frame with its matched pairs (k, 2)."""
+    numbers = {view.robot: i for i, view in enumerate(frame.views)}
+    methods = dict.fromkeys(record.method for record, _ in found)
+    results = [_result(method, [f for f in found if f[0].method == method], numbers) for method in methods]
+    return Page(dataset.name, frame.episode, frame.index, "episode", None, [_sight(v) for v in frame.views], results)
+
+
+def _sight(view: View) -> Sight:
+    known = view.pose_truth is not None
+    places = transform(view.pose_truth, view.graph.positions) if view.pose_truth is not None else view.graph.positions
+    truth: list[list[float] | None] = []
+    if view.truth is not None:
+        truth = [rounded(p) if np.isfinite(p).all() else None for p in view.truth]
+    return Sight(
+        robot=view.robot,
+        image=None,
+        pose=rounded(view.pose_truth.ravel()) if known and view.pose_truth is not None else None,
+        boxes=[],
+        places=rounded(places),
+        identity=view.identity.tolist(),
+        truth=truth,
+    )
+
+
+def _result(method: str, found: Sequence[tuple[Record, np.ndarray]], numbers: dict[str, int]) -> Result:
+    return Result(
+        method=method,
+        robots=[[numbers[r.source], numbers[r.partner]] for r, pairs in found for _ in pairs],
+        pairs=[match for _, pairs in found for match in pairs.tolist()],
+        scores=[score for r, _ in found for score in r.scores],
+        hits=[hit for r, _ in found for hit in r.hits],
+        common=sum(r.common for r, _ in found),
+    )
+
+
+def with_images(dataset: Dataset, pages: Sequence[Page]) -> list[Page]:
+    """The pages with images (where `robots.parquet` has them) and boxes (where `detections.parquet` has them)."""
+    wanted = sorted({p.frame for p in pages if p.role != "episode"})
+    images = _column(dataset.path / "robots.parquet", "image", wanted)
+    boxes = _column(dataset.path / "detections.parquet", "box", wanted)
+    order = {
+        (frame.index, view.robot): view.order
+        for frame in (dataset.frame(int(i)) for i in np.flatnonzero(np.isin(dataset.frame_index, wanted)))
+        for view in frame.views
+    }
+    if not images or not boxes:
+        return list(pages)
+    out = []
+    for kept in pages:
+        if kept.role == "episode":
+            out.append(kept)
+            continue
+        sights = [
+            replace(
+                sight,
+                image=recompressed(images[kept.frame, sight.robot][0]),
+                boxes=[rounded(boxes[kept.frame, sight.robot][k]) for k in order[kept.frame, sight.robot]],
+            )
+            if (kept.frame, sight.robot) in images and len(sight.identity)
+            else sight
+            for sight in kept.sights
+        ]
+        out.append(replace(kept, sights=sights, image_size=_size(dataset)))
+    return out
+
+
+def _size(dataset: Dataset) -> list[int] | None:
+    size = dataset._meta["image_size"]
+    return None if size is None else list(size)
+
+
+def _column(file: Path, name: str, frames: Sequence[int]) -> dict[tuple[int, str], list[Any]]:
+    """The values of a column by frame and robot, in stored order; nothing when the file lacks it."""
+    if not frames or name not in pq.read_schema(file).names:
+        return {}
+    table = pq.read_table(file, columns=["frame", "robot", name], filters=[("frame", "in", list(frames))])
+    found: dict[tuple[int, str], list[Any]] = {}
+    for row in table.to_pylist():
+        if row[name] is not None:
+            found.setdefault((row["frame"], row["robot"]), []).append(row[name])
+    return found
