@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from .benchmark import benchmark
-from .engine import write_atomically
 from .extras import require
 from .methods import Method
 from .settings import SCENE_NAMES, Settings
+from .shards import write_atomically
 
 METHODS = ("random", "reid", "rgm", "bayes", "oracle")
 EPISODES = 2

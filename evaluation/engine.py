@@ -1,227 +1,296 @@
-"""Work units and the local engine: a benchmark run is a list of units, each a chunk of episodes times all methods.
+"""Runs units, here or elsewhere, and keeps what they yield.
 
-A unit's records depend on nothing but the unit, so that serial, parallel and resumed runs agree bit for bit. With an
-output folder each finished unit becomes one Parquet shard by an atomic rename; a resumed run skips the shards it finds.
+A unit's records depend on nothing but the unit, so that serial, parallel, distributed and resumed runs agree bit for
+bit (`match_ms` aside). What runs the units is an executor, a plain callable `(todo, run_one) -> (number, outcome)...`:
+it calls `run_one(number)` for every number in `todo`, wherever and in whichever order it likes, and yields what came of
+each as it comes. `run_one` can be pickled. A unit that was lost, because its worker died, is yielded as a `Failure`.
 """
 
 from __future__ import annotations
 
-import json
 import os
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
-from functools import lru_cache
-from multiprocessing import get_context
-from pathlib import Path
+import pickle
+import signal
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from importlib import import_module
+from multiprocessing import get_context, parent_process
+from time import perf_counter
+from typing import Any
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
-from .dataset_pages import with_images
-from .datasets import Dataset, load_dataset
-from .methods import Method
-from .pictures import Page, PictureBook
+from ..matching import PriorRequiredError
+from .experiments import Unit, run_unit
+from .extras import MissingExtraError
+from .matching_run import MatcherFailedError
 from .pictures import to_table as pictures_table
-from .provenance import FILE as PROVENANCE
-from .provenance import with_session
 from .records import Record, from_table, to_table
-from .run_dataset import run_episodes
-from .settings import Settings
+from .shards import PICTURES, RECORDS, Shards, facts, with_facts
 
-FRAMES_PER_UNIT = 100
-EPISODES_PER_SCENE = 10
-EPISODES_PER_UNIT = 2
+ATTEMPTS = 3
+"""How often a unit is tried before it is given up."""
 
-
-@dataclass(frozen=True)
-class Unit:
-    """A chunk of episodes of one target. `kind` is `dataset` (target = folder) or `scene` (target = name)."""
-
-    kind: str
-    target: str
-    episodes: tuple[int, ...]
+FINAL = (ValueError, PriorRequiredError, MatcherFailedError, MissingExtraError)
+"""Errors that a second attempt would only repeat: they end the run at once."""
 
 
-def dataset_units(path: str, settings: Settings) -> list[Unit]:
-    """Whole episodes, chunked to about FRAMES_PER_UNIT frames."""
-    dataset = _dataset(path, settings.seed)
-    chunk: list[int] = []
-    size = 0
-    units: list[Unit] = []
-    episodes, frames = _episode_sizes(dataset)
-    for episode, n in list(zip(episodes, frames, strict=True))[: settings.episodes]:
-        chunk.append(episode)
-        size += n
-        if size >= FRAMES_PER_UNIT:
-            units.append(Unit("dataset", path, tuple(chunk)))
-            chunk, size = [], 0
-    if chunk:
-        units.append(Unit("dataset", path, tuple(chunk)))
-    return units
+class WorkerDiedError(RuntimeError):
+    """The process that ran a unit ended without a word: killed, or out of memory."""
 
 
-def scene_units(scene: str, settings: Settings) -> list[Unit]:
-    """Episodes 0, 1, ... of a scene, two a unit."""
-    episodes = range(settings.episodes or EPISODES_PER_SCENE)
-    return [
-        Unit("scene", scene, tuple(episodes[k : k + EPISODES_PER_UNIT]))
-        for k in range(0, len(episodes), EPISODES_PER_UNIT)
-    ]
+class UnitFailedError(RuntimeError):
+    """Units failed at every attempt; the message names them and the cause."""
+
+
+@dataclass(frozen=True, eq=False)
+class Done:
+    """A finished unit: its tables by folder, or None where the worker has written the shards itself."""
+
+    tables: dict[str, pa.Table] | None
 
 
 @dataclass(frozen=True)
-class UnitResult:
-    """What a unit leaves behind: its records, and some frames for the report (none unless asked for)."""
+class Failure:
+    """A unit that failed. `error` can be pickled."""
 
-    records: list[Record]
-    pages: list[Page]
+    error: Exception
+
+    @classmethod
+    def of(cls, error: Exception) -> Failure:
+        try:
+            pickle.loads(pickle.dumps(error))
+        except Exception:
+            return cls(RuntimeError(f"{type(error).__name__}: {error}"))
+        return cls(error)
 
 
-def run_unit(unit: Unit, methods: Sequence[Method], settings: Settings, pictures: bool = False) -> UnitResult:
-    """Records of a unit; with `pictures` also the frames that a report shows."""
-    if unit.kind == "dataset":
-        dataset = _dataset(unit.target, settings.seed)
-        book = PictureBook(int(dataset.episode[0])) if pictures else None
-        records = run_episodes(dataset, unit.episodes, methods, settings, book)
-        return UnitResult(records, [] if book is None else with_images(dataset, book.pages()))
-    # Imported here: matching on dataset folders runs without the simulators.
-    from . import run_scene
+Outcome = Done | Failure
+RunOneUnit = Callable[[int], Outcome]
+Executor = Callable[[Sequence[int], RunOneUnit], Iterator[tuple[int, Outcome]]]
 
-    book = PictureBook(0) if pictures else None
-    records = run_scene.run_episodes(unit.target, unit.episodes, methods, settings, book)
-    return UnitResult(records, [] if book is None else book.pages())
+
+@dataclass(frozen=True)
+class RunOne:
+    """Runs the unit of a number; written to be sent to a worker once.
+
+    Attributes:
+        units: all units of the run.
+        shards: where to write the tables; None hands them back.
+        pictures: also make the frames that a report shows.
+        about: kept in each unit's records, together with the `seconds` it took.
+    """
+
+    units: tuple[Unit, ...]
+    shards: Shards | None = None
+    pictures: bool = False
+    about: Mapping[str, Any] = field(default_factory=dict)
+
+    def __call__(self, number: int) -> Outcome:
+        start = perf_counter()
+        try:
+            result = run_unit(self.units[number], self.pictures)
+            seconds = perf_counter() - start
+            tables = {RECORDS: with_facts(to_table(result.records), seconds=seconds, **self.about)}
+            if self.pictures:
+                tables[PICTURES] = pictures_table(result.pages)
+            if self.shards is None:
+                return Done(tables)
+            self.shards.write(number, tables)
+        except Exception as error:
+            return Failure.of(error)
+        return Done(None)
+
+
+@dataclass(frozen=True, eq=False)
+class Results:
+    """What a run has yielded, unit by unit, from memory or from the run's folder."""
+
+    units: tuple[Unit, ...]
+    table: Callable[[int], pa.Table]
+
+    def records(self, experiment: str) -> list[Record]:
+        """Records of one experiment, in the order of its units."""
+        return [r for number in self._numbers(experiment) for r in from_table(self.table(number))]
+
+    def facts(self, experiment: str) -> list[dict[str, Any]]:
+        """What was noted about each of its units: `seconds`, and what `run` was told `about` them."""
+        return [facts(self.table(number)) for number in self._numbers(experiment)]
+
+    def _numbers(self, experiment: str) -> list[int]:
+        return [number for number, unit in enumerate(self.units) if unit.experiment.id == experiment]
 
 
 def run(
     units: Sequence[Unit],
-    methods: Sequence[Method],
-    settings: Settings,
+    executor: Executor,
     *,
-    workers: int = 1,
-    out: Path | None = None,
-    resume: bool = False,
+    shards: Shards | None = None,
+    shared_folder: bool = True,
+    about: Mapping[str, Any] | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> list[Record]:
-    """All records, in the order of the units.
+) -> Results:
+    """Run all units that `shards` does not hold yet.
 
     Args:
         units: the work.
-        workers: processes; 1 runs here.
-        out: folder for shards and run.json; None keeps everything in memory.
-        resume: skip units whose shard is there.
+        executor: what runs it.
+        shards: the run's folder, opened; None keeps everything in memory.
+        shared_folder: workers see that folder and write their shards themselves.
+        about: noted in each unit's records.
         progress: called with (units done, units in all).
 
     Raises:
-        FileExistsError: `out` holds another run, or holds this one and `resume` is off.
-        ValueError: fewer than one worker.
+        UnitFailedError: units failed ATTEMPTS times; all others are finished.
+        Exception: an error of FINAL that a unit raised.
+    """
+    units = tuple(units)
+    kept: dict[int, pa.Table] = {}
+    finished = shards.finished() if shards is not None else set()
+    run_one = RunOne(units, shards if shared_folder else None, shards is not None, about or {})
+    progress(len(finished), len(units))
+    todo = [number for number in range(len(units)) if number not in finished]
+    for number, tables in _until_done(todo, run_one, executor):
+        if tables is not None and shards is not None:
+            shards.write(number, tables)
+        elif tables is not None:
+            kept[number] = tables[RECORDS]
+        finished.add(number)
+        progress(len(finished), len(units))
+    return Results(units, kept.__getitem__ if shards is None else shards.read)
+
+
+def _until_done(
+    todo: Sequence[int], run_one: RunOne, executor: Executor
+) -> Iterator[tuple[int, dict[str, pa.Table] | None]]:
+    """Every unit once it is done. Units that failed are tried again when the others are through, one by one, so that
+    one that takes its worker down takes no other with it."""
+    rounds: list[Sequence[int]] = [todo] if todo else []
+    failed: dict[int, list[Exception]] = {}
+    while rounds:
+        for number, outcome in executor(rounds.pop(0), run_one):
+            if isinstance(outcome, Done):
+                failed.pop(number, None)
+                yield number, outcome.tables
+                continue
+            if isinstance(outcome.error, FINAL):
+                raise outcome.error
+            failed.setdefault(number, []).append(outcome.error)
+            if len(failed[number]) < ATTEMPTS:
+                rounds.append([number])
+    if failed:
+        raise UnitFailedError(_failures(failed, run_one.units))
+
+
+def _failures(failed: Mapping[int, Sequence[Exception]], units: Sequence[Unit]) -> str:
+    shown = [
+        f"unit {number} ({units[number]}) failed {len(errors)} times: {type(errors[-1]).__name__}: {errors[-1]}"
+        for number, errors in sorted(failed.items())
+    ]
+    more = f"; and {len(shown) - 3} more" if len(shown) > 3 else ""
+    return "; ".join(shown[:3]) + more + f". {len(units) - len(failed)} of {len(units)} units are finished"
+
+
+def make_executor(engine: str = "local", workers: int = 1, ray_address: str | None = None) -> Executor:
+    """The executor of `--engine`.
+
+    Args:
+        engine: `local` or `ray`.
+        workers: local processes, 1 = this one; on Ray, units at a time.
+        ray_address: of a running cluster; None starts one here.
+
+    Raises:
+        ValueError: an unknown engine, fewer than one worker, or an address without Ray.
+        MissingExtraError: `ray` without the package.
     """
     if workers < 1:
         raise ValueError(f"workers must be at least 1, got {workers}")
-    shards = None if out is None else Shards.open(out, units, methods, settings, resume)
-    results: dict[int, list[Record]] = {} if shards is None else shards.finished()
-    progress(len(results), len(units))
-    todo = [i for i in range(len(units)) if i not in results]
-    for number, result in _execute(todo, units, methods, settings, workers, pictures=shards is not None):
-        if shards is not None:
-            shards.write(number, result)
-        results[number] = result.records
-        progress(len(results), len(units))
-    return [record for number in sorted(results) for record in results[number]]
+    if engine == "ray":
+        # By name, when asked for: Ray is an extra.
+        return import_module(".engine_ray", __package__).ray_executor(ray_address, workers)
+    if engine != "local":
+        raise ValueError(f"engine must be local or ray, got {engine!r}")
+    if ray_address is not None:
+        raise ValueError(f"--ray-address {ray_address} goes with --engine ray")
+    return serial if workers == 1 else partial(processes, workers)
 
 
-def _execute(
-    todo: Sequence[int],
-    units: Sequence[Unit],
-    methods: Sequence[Method],
-    settings: Settings,
-    workers: int,
-    pictures: bool,
-) -> Iterator[tuple[int, UnitResult]]:
-    if workers == 1:
-        for i in todo:
-            yield i, run_unit(units[i], methods, settings, pictures)
-        return
-    # Spawned, not forked: Numba's and pybullet's state does not survive a fork.
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        futures = {pool.submit(run_unit, units[i], methods, settings, pictures): i for i in todo}
-        try:
-            for future in as_completed(futures):
-                yield futures[future], future.result()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+def serial(todo: Sequence[int], run_one: RunOneUnit) -> Iterator[tuple[int, Outcome]]:
+    """One unit after the other, in this process."""
+    for number in todo:
+        yield number, run_one(number)
 
 
-@dataclass(frozen=True)
-class Shards:
-    """The output folder of one run."""
-
-    folder: Path
-    n: int
-
-    @classmethod
-    def open(
-        cls, out: Path, units: Sequence[Unit], methods: Sequence[Method], settings: Settings, resume: bool
-    ) -> Shards:
-        config = {
-            "units": [asdict(u) for u in units],
-            "methods": [m.label for m in methods],
-            "settings": asdict(settings),
-        }
-        folder = out / "records"
-        file = out / "run.json"
-        if file.exists():
-            if json.loads(file.read_text()) != json.loads(json.dumps(config)):
-                raise FileExistsError(
-                    f"{out} holds a run with other targets, methods or settings; choose another --out"
-                )
-            if not resume:
-                raise FileExistsError(f"{out} holds this run already; give --resume to go on with it")
-        folder.mkdir(parents=True, exist_ok=True)
-        (out / "pictures").mkdir(exist_ok=True)
-        sessions = out / PROVENANCE
-        earlier = sessions.read_text() if file.exists() and sessions.exists() else None
-        write_atomically(sessions, with_session(earlier, settings))
-        write_atomically(file, json.dumps(config, indent=1).encode())
-        return cls(folder, len(units))
-
-    def finished(self) -> dict[int, list[Record]]:
-        return {i: from_table(pq.read_table(self._file(i))) for i in range(self.n) if self._file(i).exists()}
-
-    def write(self, number: int, result: UnitResult) -> None:
-        """The records last: a unit whose records are there is finished."""
-        _write_table(pictures_table(result.pages), self.folder.parent / "pictures" / self._file(number).name)
-        _write_table(to_table(result.records), self._file(number))
-
-    def _file(self, number: int) -> Path:
-        return self.folder / f"unit-{number:05d}.parquet"
+def processes(workers: int, todo: Sequence[int], run_one: RunOneUnit) -> Iterator[tuple[int, Outcome]]:
+    """As many units at a time as there are workers; a worker that dies costs those that were running."""
+    waiting = deque(todo)
+    while waiting:
+        with _pool(min(workers, len(waiting)), run_one) as pool:
+            yield from _feed(pool, workers, waiting)
 
 
-def _write_table(table: pa.Table, file: Path) -> None:
-    temporary = file.with_suffix(f".{os.getpid()}.tmp")
-    pq.write_table(table, temporary)
-    os.replace(temporary, file)
+def _feed(pool: ProcessPoolExecutor, workers: int, waiting: deque[int]) -> Iterator[tuple[int, Outcome]]:
+    """Until nothing waits any more or the pool is broken."""
+    running: dict[Future[Outcome], int] = {}
+    broken = False
+    while running or (waiting and not broken):
+        while waiting and len(running) < workers and not broken:
+            try:
+                running[pool.submit(_run_here, waiting[0])] = waiting[0]
+                waiting.popleft()
+            except BrokenProcessPool:
+                broken = True
+        done, _ = wait(running, return_when=FIRST_COMPLETED)
+        for future in done:
+            number = running.pop(future)
+            try:
+                yield number, future.result()
+            except BrokenProcessPool:
+                broken = True
+                yield number, Failure(WorkerDiedError("its worker process died (killed, or out of memory?)"))
 
 
-def write_atomically(file: Path, content: bytes) -> None:
-    temporary = file.with_name(f"{file.name}.{os.getpid()}.tmp")
-    temporary.write_bytes(content)
-    os.replace(temporary, file)
+@contextmanager
+def _pool(workers: int, run_one: RunOneUnit) -> Iterator[ProcessPoolExecutor]:
+    """Spawned, not forked: Numba's and pybullet's state does not survive a fork."""
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=_begin_worker, initargs=(run_one,))
+    try:
+        yield pool
+    except BaseException:
+        # Shards appear by rename, so that a worker may be stopped at any moment.
+        started = list((getattr(pool, "_processes", None) or {}).values())
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in started:
+            process.terminate()
+        raise
+    pool.shutdown()
 
 
-def _episode_sizes(dataset: Dataset) -> tuple[list[int], list[int]]:
-    sizes: dict[int, int] = {}
-    for episode in dataset.episode.tolist():
-        sizes[episode] = sizes.get(episode, 0) + 1
-    return list(sizes), list(sizes.values())
+_run_one: RunOneUnit | None = None
 
 
-@lru_cache(maxsize=4)
-def _dataset(path: str, seed: int) -> Dataset:
-    return load_dataset(path, seed)
+def _begin_worker(run_one: RunOneUnit) -> None:
+    global _run_one
+    _run_one = run_one
+    # An interrupt reaches the whole process group; the parent alone decides what follows from it.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
-def target_name(unit: Unit, settings: Settings) -> str:
-    """The name rows carry: a dataset's own, a scene's."""
-    return _dataset(unit.target, settings.seed).name if unit.kind == "dataset" else unit.target
+def _end_with_parent() -> None:
+    """A killed run leaves no workers behind."""
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _run_here(number: int) -> Outcome:
+    assert _run_one is not None
+    return _run_one(number)

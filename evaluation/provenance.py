@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import platform
 import shlex
 import subprocess
@@ -12,31 +11,31 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from .settings import Settings
-
 PACKAGES = ("covis", "numpy", "scipy", "numba", "pyarrow", "pettingzoo", "highway-env", "pybullet", "torch")
-FILE = "provenance.json"
+RENDERER = "covis.envs.camera rasteriser (backend raster)"
+"""Renderers differ in pixels; the benchmark's scenes use this one."""
 
 
-def provenance(settings: Settings) -> dict[str, Any]:
+def provenance() -> dict[str, Any]:
     """One session of a run: what was called, with which code, on what."""
     return {
         "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
         "commit": commit(),
         "versions": {"python": platform.python_version()} | versions(),
         "machine": f"{platform.system()} {platform.machine()}",
-        "renderer": "covis.envs.camera rasteriser (backend raster)",
-        "perception": settings.perception,
+        "renderer": RENDERER,
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
     }
 
 
 def commit() -> str | None:
     """The commit of this code, `+` appended when files differ from it; None outside a git checkout."""
-    here = Path(__file__).resolve().parent
+    root = Path(__file__).resolve().parents[1]
+    if not (root / ".git").exists():  # installed into somebody else's checkout
+        return None
     try:
-        head = _git(here, "rev-parse", "--short=10", "HEAD")
-        changed = _git(here, "status", "--porcelain", "--untracked-files=no")
+        head = _git(root, "rev-parse", "--short=10", "HEAD")
+        changed = _git(root, "status", "--porcelain", "--untracked-files=no")
     except (OSError, subprocess.SubprocessError):
         return None
     return head + ("+" if changed else "")
@@ -51,12 +50,6 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return found
-
-
-def with_session(earlier: str | None, settings: Settings) -> bytes:
-    """The content of provenance.json: sessions already in it, and this one."""
-    sessions = json.loads(earlier)["sessions"] if earlier else []
-    return json.dumps({"sessions": [*sessions, provenance(settings)]}, indent=1).encode()
 
 
 def _git(folder: Path, *arguments: str) -> str:

@@ -19,8 +19,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from .datasets import FORMAT, VERSION, DatasetError, load_dataset
-from .engine import write_atomically
 from .settings import Settings, scene_preset
+from .shards import write_atomically
 
 FLOATS = pa.list_(pa.float64())
 ROBOTS = pa.schema(

@@ -15,6 +15,8 @@ from .statistics import bootstrap_f1
 
 SCHEMA = pa.schema(
     [
+        ("experiment", pa.string()),
+        ("seed", pa.int64()),
         ("target", pa.string()),
         ("method", pa.string()),
         ("episode", pa.int64()),
@@ -43,11 +45,11 @@ SCHEMA = pa.schema(
 class Record:
     """One pair of views matched by one method.
 
-    `visible` counts objects that both cameras could see (None on datasets, which do not know); `scores` and `hits` run
-    over the emitted matches; the errors (m) over objects both localised, where positions are scored, each with the
-    object's distance from the robot that errs and how much of it is hidden there (0 to 1). `common_...` runs over the
-    objects both detected: the larger distance, the larger occlusion, and whether they were matched rightly; the
-    occlusion is empty on datasets, which do not know it.
+    `experiment` and `seed` say of which part of a run; `visible` counts objects that both cameras could see (None on
+    datasets, which do not know); `scores` and `hits` run over the emitted matches; the errors (m) over objects both
+    localised, where positions are scored, each with the object's distance from the robot that errs and how much of it
+    is hidden there (0 to 1). `common_...` runs over the objects both detected: the larger distance, the larger
+    occlusion, and whether they were matched rightly; the occlusion is empty on datasets, which do not know it.
     """
 
     target: str
@@ -70,6 +72,8 @@ class Record:
     common_range_m: list[float] = field(default_factory=list)
     common_occlusion: list[float] = field(default_factory=list)
     common_found: list[bool] = field(default_factory=list)
+    experiment: str = ""
+    seed: int = 0
 
     @classmethod
     def of_matching(
@@ -102,11 +106,11 @@ def from_table(table: pa.Table) -> list[Record]:
 def summarise(records: Sequence[Record], bootstrap_seed: int = 0) -> dict[str, Any]:
     """The figures of one row: pooled over the records of one target and one method."""
     total = pooled([r.counts for r in records])
-    low, high = bootstrap_f1([r.episode for r in records], [r.counts for r in records], seed=bootstrap_seed)
+    low, high = bootstrap_f1([(r.seed, r.episode) for r in records], [r.counts for r in records], seed=bootstrap_seed)
     scores = np.array([s for r in records for s in r.scores])
     hits = np.array([h for r in records for h in r.hits], dtype=bool)
     row: dict[str, Any] = {
-        "frames": len({(r.episode, r.frame) for r in records}),
+        "frames": len({(r.seed, r.episode, r.frame) for r in records}),
         "pairs": len(records),
         "precision": total.precision,
         "recall": total.recall,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 
 import numpy as np
 
@@ -10,13 +10,14 @@ from ..matching.metrics import Counts
 
 
 def bootstrap_f1(
-    episodes: Sequence[int], counts: Sequence[Counts], samples: int = 2000, level: float = 0.95, seed: int = 0
+    episodes: Sequence[Hashable], counts: Sequence[Counts], samples: int = 2000, level: float = 0.95, seed: int = 0
 ) -> tuple[float, float]:
     """Percentile interval of the pooled F1 over resampled episodes; (0, 0) without data."""
     if not counts:
         return 0.0, 0.0
-    _, group = np.unique(np.asarray(episodes), return_inverse=True)
-    n = int(group.max()) + 1
+    numbers: dict[Hashable, int] = {}
+    group = [numbers.setdefault(episode, len(numbers)) for episode in episodes]
+    n = len(numbers)
     sums = np.zeros((n, 3))
     np.add.at(sums, group, np.array([(c.correct, c.retrieved, c.common) for c in counts], dtype=float))
     rng = np.random.default_rng(seed)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.table import Table
@@ -12,7 +14,7 @@ from rich.table import Table
 from ..evaluation.benchmark import benchmark as run_benchmark
 from ..evaluation.methods import Method
 from ..evaluation.settings import Settings
-from .console import fail, out, progress_bar, write_rows
+from .console import err, fail, out, progress_bar, write_rows
 
 
 def benchmark(
@@ -28,9 +30,12 @@ def benchmark(
     seed: Annotated[int, typer.Option(help="Seed of shuffling, scenes and matchers.")] = 0,
     episodes: Annotated[int | None, typer.Option(help="Episodes per scene, or the first so many of a dataset.")] = None,
     perception: Annotated[str, typer.Option(help="simulated | learned.")] = "simulated",
-    workers: Annotated[int, typer.Option(help="Local processes.")] = 1,
+    workers: Annotated[int, typer.Option(help="Processes; on Ray, units at a time.")] = 1,
+    engine: Annotated[str, typer.Option(help="local | ray.")] = "local",
+    ray_address: Annotated[str | None, typer.Option(help="A running Ray cluster: auto, or HOST:PORT.")] = None,
     out_dir: Annotated[Path | None, typer.Option("--out", help="Keep the records here; needed to resume.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in --out.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run in --out.")] = False,
     json_target: Annotated[str | None, typer.Option("--json", help="Write rows to FILE; - prints them.")] = None,
 ) -> None:
     """Score matchers by precision, recall, F1, calibration and displacement error."""
@@ -40,17 +45,41 @@ def benchmark(
     try:
         settings = Settings(pose, preset, min_common, sequence, seed, episodes, perception)  # type: ignore[arg-type]
         methods = [Method.parse(text) for text in method or default_methods(settings)]
-        if resume and out_dir is None:
-            raise ValueError("--resume needs --out")
+        if (resume or overwrite) and out_dir is None:
+            raise ValueError(f"{'--resume' if resume else '--overwrite'} needs --out")
+        if resume and overwrite:
+            raise ValueError("give --resume or --overwrite, not both")
         with progress_bar("benchmark") as progress:
             rows = run_benchmark(
-                targets, methods, settings, workers=workers, out=out_dir, resume=resume, progress=progress
+                targets,
+                methods,
+                settings,
+                workers=workers,
+                engine=engine,
+                ray_address=ray_address,
+                out=out_dir,
+                resume=resume,
+                overwrite=overwrite,
+                progress=progress,
             )
-    except (ValueError, RuntimeError, FileExistsError) as error:
+    except (ValueError, RuntimeError, OSError) as error:
         fail(error)
+    except KeyboardInterrupt:
+        _interrupted(out_dir)
     write_rows(rows, json_target)
     if json_target != "-":
         out.print(table(rows))
+
+
+def _interrupted(out_dir: Path | None) -> NoReturn:
+    """One line on what is left, exit status 130."""
+    if out_dir is None:
+        err.print("interrupted; nothing is kept without --out")
+    else:
+        again = [*sys.argv[1:], *([] if "--resume" in sys.argv else ["--resume"])]
+        again = [word for word in again if word != "--overwrite"]
+        err.print(f"interrupted; go on with: covis {shlex.join(again)}", highlight=False, markup=False, soft_wrap=True)
+    raise typer.Exit(130)
 
 
 def _perception(targets: list[str], seed: int, json_target: str | None) -> None:

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from covis.evaluation import engine
+from covis.evaluation import experiments
 from covis.evaluation.benchmark import benchmark
 from covis.evaluation.datasets import DatasetError, load_dataset
 from covis.evaluation.matching_run import MatcherFailedError
@@ -77,14 +77,14 @@ def test_methods_do_not_disturb_each_other(small_dataset):
 
 
 def test_parallel_equals_serial(small_dataset, monkeypatch):
-    monkeypatch.setattr(engine, "FRAMES_PER_UNIT", 2)
+    monkeypatch.setattr(experiments, "FRAMES_PER_UNIT", 2)
     serial = benchmark([str(small_dataset)], METHODS, Settings(pose="known"))
     parallel = benchmark([str(small_dataset)], METHODS, Settings(pose="known"), workers=2)
     assert without_time(serial) == without_time(parallel)
 
 
 def test_resume_after_an_interruption(small_dataset, tmp_path, monkeypatch):
-    monkeypatch.setattr(engine, "FRAMES_PER_UNIT", 1)
+    monkeypatch.setattr(experiments, "FRAMES_PER_UNIT", 1)
     settings, out = Settings(pose="known"), tmp_path / "run"
     expected = benchmark([str(small_dataset)], METHODS, settings)
 

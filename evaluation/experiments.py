@@ -1,0 +1,139 @@
+"""What a run consists of: experiments, cut into units that need nothing else to be run anywhere."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Literal
+
+from .dataset_pages import with_images
+from .datasets import Dataset, load_dataset
+from .methods import Method
+from .pictures import Page, PictureBook
+from .records import Record
+from .run_dataset import run_episodes
+from .settings import Settings
+
+Kind = Literal["dataset", "scene"]
+
+FRAMES_PER_UNIT = 100
+EPISODES_PER_SCENE = 10
+EPISODES_PER_UNIT = 2
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One target under one set of settings, with every method: what one group of rows is about.
+
+    Attributes:
+        id: unique in a run.
+        kind: `dataset` (target = folder) or `scene` (target = name).
+        target: see `kind`.
+        methods: texts of `--method`; all of them see the same frames.
+        settings: options; their seed is replaced by each of `seeds`.
+        seeds: one independent run each; rows pool over them.
+    """
+
+    id: str
+    kind: Kind
+    target: str
+    methods: tuple[str, ...]
+    settings: Settings
+    seeds: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A chunk of an experiment's episodes under one of its seeds. Its records depend on nothing else."""
+
+    experiment: Experiment
+    seed: int
+    episodes: tuple[int, ...]
+
+    @property
+    def settings(self) -> Settings:
+        return replace(self.experiment.settings, seed=self.seed)
+
+    def __str__(self) -> str:
+        shown = ", ".join(map(str, self.episodes[:3])) + (", ..." if len(self.episodes) > 3 else "")
+        return f"{self.experiment.id}, seed {self.seed}, episodes {shown}"
+
+
+def units_of(experiments: Sequence[Experiment]) -> list[Unit]:
+    """All units, in order of experiment, seed and episode.
+
+    Raises:
+        ValueError: two experiments of one id.
+        DatasetError: a dataset folder that cannot be read.
+    """
+    ids = [experiment.id for experiment in experiments]
+    if len(set(ids)) < len(ids):
+        raise ValueError(f"experiments must have different ids, got {', '.join(ids)}")
+    return [
+        Unit(experiment, seed, episodes)
+        for experiment in experiments
+        for seed in experiment.seeds
+        for episodes in _chunks(experiment)
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class UnitResult:
+    """What a unit leaves behind: its records, and some frames for the report (none unless asked for)."""
+
+    records: list[Record]
+    pages: list[Page]
+
+
+def run_unit(unit: Unit, pictures: bool = False) -> UnitResult:
+    """Records of a unit, in order of time, pair and method; with `pictures` also the frames that a report shows."""
+    experiment = unit.experiment
+    methods = [Method.parse(text) for text in experiment.methods]
+    if experiment.kind == "dataset":
+        data = dataset(experiment.target, unit.seed)
+        book = PictureBook(int(data.episode[0])) if pictures else None
+        records = run_episodes(data, unit.episodes, methods, unit.settings, book)
+        pages = [] if book is None else with_images(data, book.pages())
+    else:
+        # Imported here: matching on dataset folders runs without the simulators.
+        from . import run_scene
+
+        book = PictureBook(0) if pictures else None
+        records = run_scene.run_episodes(experiment.target, unit.episodes, methods, unit.settings, book)
+        pages = [] if book is None else book.pages()
+    return UnitResult([replace(r, experiment=experiment.id, seed=unit.seed) for r in records], pages)
+
+
+def target_name(experiment: Experiment) -> str:
+    """The name rows carry: a dataset's own, a scene's."""
+    if experiment.kind == "dataset":
+        return dataset(experiment.target, experiment.seeds[0]).name
+    return experiment.target
+
+
+def _chunks(experiment: Experiment) -> list[tuple[int, ...]]:
+    if experiment.kind == "dataset":
+        return _by_frames(dataset(experiment.target, experiment.seeds[0]), experiment.settings.episodes)
+    episodes = range(experiment.settings.episodes or EPISODES_PER_SCENE)
+    return [tuple(episodes[k : k + EPISODES_PER_UNIT]) for k in range(0, len(episodes), EPISODES_PER_UNIT)]
+
+
+def _by_frames(data: Dataset, limit: int | None) -> list[tuple[int, ...]]:
+    """The first `limit` episodes (None = all), whole, chunked to about FRAMES_PER_UNIT frames."""
+    sizes: dict[int, int] = {}
+    for episode in data.episode.tolist():
+        sizes[episode] = sizes.get(episode, 0) + 1
+    chunks: list[tuple[int, ...]] = []
+    chunk: list[int] = []
+    for episode in list(sizes)[:limit]:
+        chunk.append(episode)
+        if sum(sizes[e] for e in chunk) >= FRAMES_PER_UNIT:
+            chunks.append(tuple(chunk))
+            chunk = []
+    return [*chunks, tuple(chunk)] if chunk else chunks
+
+
+@lru_cache(maxsize=4)
+def dataset(path: str, seed: int) -> Dataset:
+    return load_dataset(path, seed)
