@@ -6,7 +6,6 @@ and its detections are shuffled, so that no method profits from the order in whi
 
 from __future__ import annotations
 
-import json
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,35 +13,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from ..matching import ObjectGraph, RelativePose
-from ..matching.pose import Array, check_pose, invert
+from ..matching.pose import Array, invert
+from .dataset_tables import DatasetError, bad_row, read_detections, read_meta, read_objects, read_robots
 
-FORMAT = "covis-dataset"
-VERSION = 1
 POSE_FLOOR_STD_M = 1e-3
 """Least standard deviation of a pose's translation, m."""
 POSE_FLOOR_STD_RAD = 1e-3
 """Least standard deviation of a pose's rotation about each axis, rad."""
-
-ROBOT_COLUMNS = ("frame", "robot")
-DETECTION_COLUMNS = (
-    "frame",
-    "robot",
-    "detection",
-    "identity",
-    "position",
-    "position_variance",
-    "attribute",
-    "attribute_variance",
-)
-
-
-class DatasetError(ValueError):
-    """A dataset folder that cannot be read; the message names the file, and the column and row where that is known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +38,9 @@ class View:
         pose_truth: (4, 4), or None.
         odometry: (4, 4) noisy own motion since this robot's previous frame, or None.
         order: (n,) row of each detection as stored, within this robot and frame.
+        boxes: (n, 4) px [u0, v0, u1, v1] of each detection, or None.
+        visible: identities of all objects with at least `min_pixels` visible pixels in this robot's image, detected or
+            not; None where the dataset does not say.
     """
 
     robot: str
@@ -69,6 +52,8 @@ class View:
     pose_truth: Array | None
     odometry: Array | None
     order: NDArray[np.int64]
+    boxes: Array | None = None
+    visible: NDArray[np.int64] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +99,7 @@ class Dataset:
     _detections: dict[str, Any]
     _robot_rows: dict[int, list[int]]
     _detection_rows: dict[tuple[int, str], NDArray[np.int64]]
+    _visible: dict[tuple[int, str], NDArray[np.int64]] | None
     seed: int
 
     def __len__(self) -> int:
@@ -168,6 +154,8 @@ class Dataset:
             pose_truth=_row(robots["pose_truth"], row, (4, 4)),
             odometry=_row(robots["odometry"], row, (4, 4)),
             order=order,
+            boxes=_rows(detections["box"], at, (4,)),
+            visible=None if self._visible is None else self._visible.get((frame, robot), np.zeros(0, dtype=np.int64)),
         )
 
 
@@ -186,217 +174,108 @@ def pose_covariance(pose_std: tuple[float, float] | None, up: Array | None) -> A
 
 
 def load_dataset(path: str | Path, seed: int = 0) -> Dataset:
-    """Read a dataset folder.
+    """Read a dataset folder; its images stay on disk.
 
     Args:
-        path: folder with dataset.json, robots.parquet and detections.parquet.
+        path: folder with dataset.json, robots.parquet, detections.parquet and perhaps objects.parquet.
         seed: of the shuffling of detections.
 
     Raises:
         DatasetError: a missing or unreadable file, another format or version, a missing or malformed column, a value
-            that is not finite; the message names file, column and row.
+            that is not finite or makes no sense; the message names file, column and row.
     """
     path = Path(path)
     if not path.is_dir():
         raise DatasetError(f"{path} is not a folder")
-    meta = _read_meta(path / "dataset.json")
-    robots = _read_robots(path / "robots.parquet")
-    detections = _read_detections(path / "detections.parquet", len(meta["classes"]))
+    meta = read_meta(path / "dataset.json")
+    robots = read_robots(path / "robots.parquet")
+    detections = read_detections(path / "detections.parquet", len(meta["classes"]))
+    objects = read_objects(path / "objects.parquet")
 
-    robot_rows: dict[int, list[int]] = {}
-    seen: set[tuple[int, str]] = set()
-    for row, (frame, robot) in enumerate(zip(robots["frame"], robots["robot"], strict=True)):
-        key = (int(frame), str(robot))
-        if key in seen:
-            raise DatasetError(f"{path / 'robots.parquet'}: row {row} repeats frame {frame}, robot {robot!r}")
-        seen.add(key)
-        robot_rows.setdefault(key[0], []).append(row)
-    for rows in robot_rows.values():
-        rows.sort(key=lambda r: str(robots["robot"][r]))
-
-    detection_rows: dict[tuple[int, str], list[int]] = {}
-    for row, (frame, robot) in enumerate(zip(detections["frame"], detections["robot"], strict=True)):
-        key = (int(frame), str(robot))
-        if key not in seen:
-            raise DatasetError(
-                f"{path / 'detections.parquet'}: row {row} is of frame {frame}, robot {robot!r}, "
-                "which robots.parquet lacks"
-            )
-        detection_rows.setdefault(key, []).append(row)
-
+    robot_rows = _group_robots(robots, path / "robots.parquet")
+    known = {(int(frame), robot) for frame, robot in zip(robots["frame"], robots["robot"], strict=True)}
+    detection_rows = _group(detections, "detection", known, path / "detections.parquet")
+    visible = None
+    if objects is not None and meta["min_pixels"] is not None:
+        rows = _group(objects, "identity", known, path / "objects.parquet")
+        enough = objects["pixels"] >= meta["min_pixels"]
+        visible = {key: objects["identity"][at[enough[at]]] for key, at in rows.items()}
     frame_index = np.array(sorted(robot_rows), dtype=np.int64)
-    episodes = robots["episode"]
-    episode = frame_index if episodes is None else np.array([episodes[robot_rows[int(f)][0]] for f in frame_index])
+    episode = frame_index
+    if robots["episode"] is not None:
+        episode = robots["episode"][[robot_rows[int(f)][0] for f in frame_index]]
     return Dataset(
         path=path,
         name=meta["name"],
         classes=meta["classes"],
-        has_episodes=episodes is not None,
+        has_episodes=robots["episode"] is not None,
         frame_index=frame_index,
-        episode=episode.astype(np.int64),
+        episode=episode,
         _meta=meta,
         _robots=robots,
         _detections=detections,
         _robot_rows=robot_rows,
-        _detection_rows={key: np.array(rows, dtype=np.int64) for key, rows in detection_rows.items()},
+        _detection_rows=detection_rows,
+        _visible=visible,
         seed=seed,
     )
 
 
-def _read_meta(file: Path) -> dict[str, Any]:
-    try:
-        raw = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise DatasetError(f"{file} is missing") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise DatasetError(f"{file} is not JSON: {error}") from error
-    if not isinstance(raw, dict) or raw.get("format") != FORMAT:
-        raise DatasetError(f"{file}: format is {raw.get('format') if isinstance(raw, dict) else raw!r}, not {FORMAT!r}")
-    if raw.get("version") != VERSION:
-        raise DatasetError(f"{file}: version is {raw.get('version')!r}, this reader knows {VERSION}")
-    for key in ("name", "classes"):
-        if key not in raw:
-            raise DatasetError(f"{file}: {key!r} is missing")
-    classes = raw["classes"]
-    if not isinstance(classes, list) or not classes or not all(isinstance(c, str) for c in classes):
-        raise DatasetError(f"{file}: classes must be a list of names, got {classes!r}")
-    if raw.get("units", "m") != "m":
-        raise DatasetError(f"{file}: units must be 'm', got {raw['units']!r}")
-    std = raw.get("pose_std")
-    size = raw.get("image_size")
-    try:
-        return {
-            "name": str(raw["name"]),
-            "classes": tuple(classes),
-            "up": None if raw.get("up") is None else np.asarray(raw["up"], dtype=np.float64),
-            "forward": _forward(str(raw.get("sensor_frame", ""))),
-            "image_size": None if size is None else (int(size[0]), int(size[1])),
-            "horizontal_fov_rad": raw.get("horizontal_fov_rad"),
-            "pose_std": None if std is None else (float(std["position_m"]), float(std["heading_rad"])),
-        }
-    except (TypeError, ValueError, KeyError, IndexError) as error:
-        raise DatasetError(f"{file}: up, image_size or pose_std is malformed: {error!r}") from error
+def _group_robots(robots: dict[str, Any], file: Path) -> dict[int, list[int]]:
+    """Rows of each frame, robots in the order of their names."""
+    groups: dict[int, list[int]] = {}
+    seen: set[tuple[int, str]] = set()
+    for row, key in enumerate(zip(robots["frame"].tolist(), robots["robot"], strict=True)):
+        if key in seen:
+            raise DatasetError(f"{file}: row {row} repeats frame {key[0]}, robot {key[1]!r}")
+        seen.add(key)
+        groups.setdefault(key[0], []).append(row)
+    for rows in groups.values():
+        rows.sort(key=lambda r: str(robots["robot"][r]))
+    if robots["episode"] is not None:
+        _check_episodes(robots, groups, file)
+    return groups
 
 
-def _forward(sensor_frame: str) -> Array | None:
-    """The optical axis, as the description of the sensor frame names it ("... z forward")."""
-    for axis, unit in (("x", (1.0, 0.0, 0.0)), ("y", (0.0, 1.0, 0.0)), ("z", (0.0, 0.0, 1.0))):
-        if f"{axis} forward" in sensor_frame:
-            return np.array(unit)
-    return None
+def _check_episodes(robots: dict[str, Any], groups: dict[int, list[int]], file: Path) -> None:
+    """One episode a frame, each episode's frames in one stretch, and its time does not run backwards."""
+    episode, time = robots["episode"], robots["time"]
+    over: set[int] = set()
+    last: int | None = None
+    for frame in sorted(groups):
+        rows = groups[frame]
+        now = int(episode[rows[0]])
+        for row in rows[1:]:
+            if episode[row] != now:
+                raise bad_row(file, "episode", row, f": frame {frame} is of episode {now} and of {episode[row]}")
+        if last is not None and now != episode[last]:
+            over.add(int(episode[last]))
+        elif last is not None and time is not None and time[rows[0]] < time[last]:
+            raise bad_row(
+                file, "time", rows[0], f": frame {frame} is at {time[rows[0]]} s, the one before at {time[last]}"
+            )
+        if now in over:
+            raise bad_row(
+                file, "episode", rows[0], f": frame {frame} goes back to episode {now}: its frames must be consecutive"
+            )
+        last = rows[0]
 
 
-def _read_robots(file: Path) -> dict[str, Any]:
-    table = _read_table(file, ROBOT_COLUMNS)
-    out: dict[str, Any] = {
-        "frame": _scalars(table, "frame", file, np.int64),
-        "robot": table.column("robot").to_pylist(),
-        "time": _scalars(table, "time", file, np.float64, nullable=True),
-        "episode": _scalars(table, "episode", file, np.int64),
-    }
-    for name, width in (("pose", 16), ("pose_truth", 16), ("odometry", 16), ("intrinsics", 9), ("up", 3)):
-        out[name] = _lists(table, name, file, width, nullable=True)
-    for name in ("pose", "pose_truth", "odometry"):
-        _check_poses(out[name], name, file)
-    return out
-
-
-def _read_detections(file: Path, n_classes: int) -> dict[str, Any]:
-    table = _read_table(file, DETECTION_COLUMNS)
-    out: dict[str, Any] = {
-        "frame": _scalars(table, "frame", file, np.int64),
-        "robot": table.column("robot").to_pylist(),
-        "identity": _scalars(table, "identity", file, np.int64),
-        "position": _lists(table, "position", file, 3),
-        "attribute": _lists(table, "attribute", file, n_classes),
-        "truth": _lists(table, "truth", file, 3, nullable=True),
-        "covariance": _lists(table, "covariance", file, 9),
-        "embedding": _lists(table, "embedding", file, None),
-    }
-    for name in ("position_variance", "attribute_variance"):
-        values = _scalars(table, name, file, np.float64)
-        assert values is not None
-        if len(values) and not (values >= 0).all():
-            row = int(np.argmin(values >= 0))
-            raise DatasetError(f"{file}: column {name!r}, row {row}: {values[row]} is not a variance")
-        out[name] = values
-    if len(out["attribute"]) and out["attribute"].min() < 0:
-        row = int(np.argmax((out["attribute"] < 0).any(axis=1)))
-        raise DatasetError(f"{file}: column 'attribute', row {row}: negative confidence {out['attribute'][row].min()}")
-    return out
-
-
-def _read_table(file: Path, required: tuple[str, ...]) -> pa.Table:
-    try:
-        table = pq.read_table(file)
-    except FileNotFoundError as error:
-        raise DatasetError(f"{file} is missing") from error
-    except (pa.ArrowException, OSError) as error:
-        raise DatasetError(f"{file} cannot be read as Parquet (truncated or corrupt?): {error}") from error
-    missing = [name for name in required if name not in table.column_names]
-    if missing:
-        raise DatasetError(f"{file}: missing column(s) {', '.join(missing)}")
-    return table
-
-
-def _scalars(table: pa.Table, name: str, file: Path, dtype: type, nullable: bool = False) -> NDArray[Any] | None:
-    if name not in table.column_names:
-        return None
-    column = table.column(name)
-    if column.null_count and not nullable:
-        row = int(np.argmax(column.is_null().to_numpy()))
-        raise DatasetError(f"{file}: column {name!r}, row {row} is null")
-    try:
-        return column.to_numpy().astype(dtype)
-    except (TypeError, ValueError) as error:
-        raise DatasetError(f"{file}: column {name!r} holds {column.type}, not numbers") from error
-
-
-def _lists(table: pa.Table, name: str, file: Path, width: int | None, nullable: bool = False) -> Array | None:
-    """A list column as (rows, width); a null row becomes NaN. None when absent or null throughout."""
-    if name not in table.column_names or (table.num_rows and table.column(name).null_count == table.num_rows):
-        return None
-    column = table.column(name).combine_chunks()
-    if not (
-        pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type) or pa.types.is_large_list(column.type)
-    ):
-        raise DatasetError(f"{file}: column {name!r} holds {column.type}, not lists")
-    null = column.is_null().to_numpy(zero_copy_only=False)
-    if null.any() and not nullable:
-        raise DatasetError(f"{file}: column {name!r}, row {int(np.argmax(null))} is null")
-    valid = column.drop_null()
-    lengths = np.array([len(x) for x in valid]) if not pa.types.is_fixed_size_list(column.type) else None
-    if lengths is None:
-        lengths = np.full(len(valid), column.type.list_size)
-    expected = width if width is not None else (int(lengths[0]) if len(lengths) else 0)
-    if len(lengths) and (lengths != expected).any():
-        row = int(np.flatnonzero(~null)[np.argmax(lengths != expected)])
-        raise DatasetError(
-            f"{file}: column {name!r}, row {row} has {lengths[lengths != expected][0]} values, expected {expected}"
-        )
-    flat = valid.flatten()
-    if flat.null_count:
-        row = int(np.flatnonzero(~null)[int(np.argmax(flat.is_null().to_numpy(zero_copy_only=False))) // expected])
-        raise DatasetError(f"{file}: column {name!r}, row {row} holds a null")
-    values = np.asarray(flat.to_numpy(zero_copy_only=False), dtype=np.float64).reshape(-1, expected)
-    if not np.isfinite(values).all():
-        row = int(np.flatnonzero(~null)[np.argmin(np.isfinite(values).all(axis=1))])
-        raise DatasetError(f"{file}: column {name!r}, row {row} is not finite")
-    out = np.full((table.num_rows, expected), np.nan)
-    out[~null] = values
-    return out
-
-
-def _check_poses(poses: Array | None, name: str, file: Path) -> None:
-    if poses is None:
-        return
-    for row, values in enumerate(poses):
-        if np.isnan(values[0]):
-            continue
-        try:
-            check_pose(values.reshape(4, 4), name)
-        except ValueError as error:
-            raise DatasetError(f"{file}: column {name!r}, row {row}: {error}") from error
+def _group(
+    table: dict[str, Any], number: str, known: set[tuple[int, str]], file: Path
+) -> dict[tuple[int, str], NDArray[np.int64]]:
+    """Rows of each (frame, robot); `number` tells the rows of one group apart."""
+    groups: dict[tuple[int, str], list[int]] = {}
+    seen: set[tuple[int, str, int]] = set()
+    columns = zip(table["frame"].tolist(), table["robot"], table[number].tolist(), strict=True)
+    for row, (frame, robot, index) in enumerate(columns):
+        if (frame, robot) not in known:
+            raise DatasetError(f"{file}: row {row} is of frame {frame}, robot {robot!r}, which robots.parquet lacks")
+        if (frame, robot, index) in seen:
+            raise DatasetError(f"{file}: row {row} repeats frame {frame}, robot {robot!r}, {number} {index}")
+        seen.add((frame, robot, index))
+        groups.setdefault((frame, robot), []).append(row)
+    return {key: np.array(rows, dtype=np.int64) for key, rows in groups.items()}
 
 
 def _row(values: Array | None, row: int, shape: tuple[int, ...]) -> Array | None:

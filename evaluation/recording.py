@@ -1,7 +1,7 @@
-"""Scenes to dataset folders: `covis record`, resumable; and `covis check`, which verifies a folder's checksums.
+"""Scenes to dataset folders: `covis record`, resumable; and `covis check`, which verifies a folder.
 
-Each episode is one pair of part files, written whole by an atomic rename; the final tables are streamed from the parts.
-A folder without dataset.json is unfinished, and no reader opens it.
+Each episode is one set of part files, each written whole by an atomic rename; the final tables are streamed from the
+parts, so that memory holds one episode. A folder without dataset.json is unfinished, and no reader opens it.
 """
 
 from __future__ import annotations
@@ -11,18 +11,24 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
-from .datasets import FORMAT, VERSION, DatasetError, load_dataset
+from .data_card import card
+from .dataset_tables import FORMAT, VERSION
+from .engine import Done, Failure, make_executor
 from .settings import Settings, scene_preset
 from .shards import write_atomically
 
 FLOATS = pa.list_(pa.float64())
+RUNS = pa.list_(pa.int32())
 ROBOTS = pa.schema(
     [
         ("frame", pa.int64()),
@@ -49,16 +55,31 @@ DETECTIONS = pa.schema(
         ("attribute_variance", pa.float64()),
         ("covariance", FLOATS),
         ("box", FLOATS),
+        ("mask", RUNS),
         ("truth", FLOATS),
     ]
 )
-TABLES = {"robots": ROBOTS, "detections": DETECTIONS}
+OBJECTS = pa.schema(
+    [
+        ("frame", pa.int64()),
+        ("robot", pa.string()),
+        ("identity", pa.int64()),
+        ("class", pa.string()),
+        ("position", FLOATS),
+        ("pixels", pa.int32()),
+        ("box", FLOATS),
+        ("mask", RUNS),
+    ]
+)
+TABLES = {"robots": ROBOTS, "detections": DETECTIONS, "objects": OBJECTS}
 CHECKSUMS = "checksums.json"
 REQUEST = "recording.json"
+HEAD = "dataset.json"
+FILES = (HEAD, CHECKSUMS, "README.md", *(f"{table}.parquet" for table in TABLES))
+FRAMES_PER_EPISODE_NUMBER = 1000
+EPISODES = 50
 
-
-class ChecksumError(DatasetError):
-    """A file of a dataset folder is missing or not what was written."""
+Rows = dict[str, list[dict[str, Any]]]
 
 
 def record(
@@ -66,99 +87,154 @@ def record(
     settings: Settings,
     out: Path,
     *,
+    workers: int = 1,
     resume: bool = False,
     overwrite: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
-    """Write `settings.episodes` episodes of a scene as a dataset folder, images included.
+    """Write `settings.episodes` episodes of a scene as a dataset folder, images and masks included.
+
+    The same call with `resume` goes on after any interruption and ends with the same files; it returns at once where
+    they are there already. The number of `workers` processes changes nothing but the time.
 
     Raises:
-        FileExistsError: the folder holds a finished dataset and `overwrite` is off, an unfinished one and `resume` is
-            off, or one of another request.
+        FileExistsError: the folder holds a finished dataset or another's files and `overwrite` is off, an unfinished
+            recording and `resume` is off, or one of another request.
+        ValueError: fewer than one worker.
     """
-    episodes = settings.episodes or 50
+    episodes = settings.episodes or EPISODES
     request = {"scene": scene, "preset": settings.preset, "seed": settings.seed, "perception": settings.perception}
-    parts = _prepare(out, request, resume, overwrite)
-    from .run_scene import make_env
-
-    env = make_env(scene, settings)
+    if not _prepare(out, request, episodes, resume, overwrite):
+        return
+    env = _own_env(scene, settings)
     try:
-        for episode in range(episodes):
-            progress(episode, episodes)
-            if not all((parts / f"{name}-{episode:05d}.parquet").exists() for name in TABLES):
-                _write_episode(env, episode, settings, parts)
-        meta = _meta(scene, env, settings)
+        _record_parts(RecordOne(scene, settings, out / "parts"), episodes, workers, progress)
+        head = _head(scene, env, settings) | {"recording": request | {"episodes": episodes}}
     finally:
         env.close()
-    for name, schema in TABLES.items():
-        _concatenate([parts / f"{name}-{e:05d}.parquet" for e in range(episodes)], out / f"{name}.parquet", schema)
-    content = json.dumps(meta, indent=1).encode()
+        _own_env.cache_clear()
+    _finish(out, head, episodes)
+
+
+def _finish(out: Path, head: dict[str, Any], episodes: int) -> None:
+    """Tables from the parts; dataset.json, which makes the folder a dataset, comes last."""
+    for table, schema in TABLES.items():
+        _concatenate([_part(out / "parts", table, e) for e in range(episodes)], out / f"{table}.parquet", schema)
+    content = json.dumps(head, indent=1).encode()
     write_atomically(out / CHECKSUMS, json.dumps(_checksums(out, content), indent=1).encode())
-    write_atomically(out / "README.md", _card(meta, settings, episodes).encode())
-    write_atomically(out / "dataset.json", content)
-    shutil.rmtree(parts)
-    (out / REQUEST).unlink()
-    progress(episodes, episodes)
+    write_atomically(out / "README.md", card(head, TABLES, _sizes(out)).encode())
+    write_atomically(out / HEAD, content)
+    _tidy(out)
 
 
-def check(folder: Path) -> int:
-    """Verify a dataset folder against its checksums and read it whole; the number of frames.
-
-    Raises:
-        ChecksumError: no checksums, or a file that differs from them; the message names it.
-        DatasetError: the folder cannot be read.
-    """
-    file = folder / CHECKSUMS
-    if not file.exists():
-        raise ChecksumError(f"{file} is missing")
-    for name, expected in json.loads(file.read_text()).items():
-        if not (folder / name).exists():
-            raise ChecksumError(f"{folder / name} is missing")
-        if _sha256(folder / name) != expected:
-            raise ChecksumError(f"{folder / name} differs from its checksum")
-    return sum(1 for _ in load_dataset(folder))
+def _tidy(out: Path) -> None:
+    """Remove what only an unfinished recording needs, and what killed ones left."""
+    shutil.rmtree(out / "parts", ignore_errors=True)
+    for name in FILES:
+        for leftover in out.glob(f"{name}.*tmp"):
+            leftover.unlink()
+    (out / REQUEST).unlink(missing_ok=True)
 
 
-def _prepare(out: Path, request: dict[str, Any], resume: bool, overwrite: bool) -> Path:
-    """The folder of part files, empty or to be gone on with."""
-    parts, file = out / "parts", out / REQUEST
-    if (out / "dataset.json").exists() and not overwrite:
+def unfinished(out: Path) -> int | None:
+    """How many whole episodes an unfinished recording holds; None where there is none."""
+    if not (out / REQUEST).exists():
+        return None
+    return len(list((out / "parts").glob(f"{list(TABLES)[-1]}-*.parquet")))
+
+
+def _prepare(out: Path, request: dict[str, Any], episodes: int, resume: bool, overwrite: bool) -> bool:
+    """Make the folder ready to record into, empty or to be gone on with; False when it is finished already."""
+    begun, head = _stored(out / REQUEST), _stored(out / HEAD)
+    if resume and head is not None and head.get("recording") == request | {"episodes": episodes}:
+        _tidy(out)
+        return False
+    if not (resume and begun == request):
+        if not overwrite:
+            _refuse_to_replace(out, begun, head)
+        shutil.rmtree(out / "parts", ignore_errors=True)
+    (out / "parts").mkdir(parents=True, exist_ok=True)
+    write_atomically(out / REQUEST, json.dumps(request).encode())
+    # From here on the folder is an unfinished recording; of an overwritten dataset dataset.json goes first.
+    for name in FILES:
+        (out / name).unlink(missing_ok=True)
+    return True
+
+
+def _refuse_to_replace(out: Path, begun: dict[str, Any] | None, head: dict[str, Any] | None) -> None:
+    if head is not None:
         raise FileExistsError(f"{out} holds a dataset already; give --overwrite to replace it")
-    if file.exists() and not overwrite:
-        if not resume:
-            raise FileExistsError(
-                f"{out} holds an unfinished recording; give --resume to go on, --overwrite to replace"
-            )
-        if json.loads(file.read_text()) != request:
-            raise FileExistsError(f"{out} holds an unfinished recording of {json.loads(file.read_text())}")
-    elif overwrite:
-        shutil.rmtree(parts, ignore_errors=True)
-        for name in ("dataset.json", CHECKSUMS, *(f"{t}.parquet" for t in TABLES)):
-            (out / name).unlink(missing_ok=True)
-    parts.mkdir(parents=True, exist_ok=True)
-    write_atomically(file, json.dumps(request).encode())
-    return parts
+    if begun is not None:
+        raise FileExistsError(
+            f"{out} holds an unfinished recording of {begun}; give --resume to go on with the same, "
+            "--overwrite to replace it"
+        )
+    there = [name for name in (*FILES, "parts") if (out / name).exists()]
+    if there:
+        raise FileExistsError(f"{out} holds files of another kind ({', '.join(there)}); choose another folder")
+
+
+def _stored(file: Path) -> dict[str, Any] | None:
+    """What a JSON file holds: None where it is missing, nothing where it is not an object."""
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except ValueError:
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def _part(parts: Path, table: str, episode: int) -> Path:
+    return parts / f"{table}-{episode:05d}.parquet"
+
+
+@dataclass(frozen=True)
+class RecordOne:
+    """Writes the part files of the episode of a number; can be sent to a worker."""
+
+    scene: str
+    settings: Settings
+    parts: Path
+
+    def __call__(self, episode: int) -> Done:
+        _write_episode(_own_env(self.scene, self.settings), episode, self.settings, self.parts)
+        return Done(None)
+
+
+def _record_parts(record_one: RecordOne, episodes: int, workers: int, progress: Callable[[int, int], None]) -> None:
+    """Part files of every episode that has none yet. Raises what an episode raised, or that its worker died."""
+    todo = [e for e in range(episodes) if not all(_part(record_one.parts, table, e).exists() for table in TABLES)]
+    done = episodes - len(todo)
+    progress(done, episodes)
+    for count, (_, outcome) in enumerate(make_executor("local", workers)(todo, record_one), done + 1):
+        if isinstance(outcome, Failure):
+            raise outcome.error
+        progress(count, episodes)
+
+
+@lru_cache(maxsize=1)
+def _own_env(scene: str, settings: Settings) -> Any:
+    from .run_scene import make_env
+
+    return make_env(scene, settings)
 
 
 def _write_episode(env: Any, episode: int, settings: Settings, parts: Path) -> None:
-    robots: list[dict[str, Any]] = []
-    detections: list[dict[str, Any]] = []
+    tables: Rows = {table: [] for table in TABLES}
     for step, rows in enumerate(_frames(env, episode, settings)):
-        frame = 1000 * episode + step
-        for robot, found in rows:
-            robots.append({"frame": frame, "episode": episode} | robot)
-            detections += [{"frame": frame, "detection": k} | row for k, row in enumerate(found)]
-    for name, table in (("robots", robots), ("detections", detections)):
-        file = parts / f"{name}-{episode:05d}.parquet"
-        temporary = file.with_suffix(".tmp")
-        pq.write_table(pa.Table.from_pylist(table, schema=TABLES[name]), temporary)
+        where = {"frame": FRAMES_PER_EPISODE_NUMBER * episode + step, "episode": episode}
+        for table in TABLES:
+            tables[table] += [where | row for row in rows[table]]
+    for table, schema in TABLES.items():
+        file = _part(parts, table, episode)
+        temporary = file.with_suffix(f".{os.getpid()}.tmp")
+        pq.write_table(pa.Table.from_pylist(tables[table], schema=schema), temporary)
         os.replace(temporary, file)
 
 
-def _frames(env: Any, episode: int, settings: Settings) -> Iterator[list[tuple[dict[str, Any], list[dict[str, Any]]]]]:
-    """Per step and robot: its row, and those of its detections."""
-    import cv2
-
+def _frames(env: Any, episode: int, settings: Settings) -> Iterator[Rows]:
+    """The rows of each step."""
     from ..agents.perception import make_perceptor
     from .run_scene import identity, look_around, step_scripted
 
@@ -167,34 +243,36 @@ def _frames(env: Any, episode: int, settings: Settings) -> Iterator[list[tuple[d
     step = 0
     while env.agents:
         views = look_around(env, perceive, observations, (settings.seed, episode, step))
-        truth, snapshot = env.ground_truth(), env.snapshot()
-        place = dict(zip(truth.identity.tolist(), truth.positions.tolist(), strict=True))
-        rows = []
+        rows: Rows = {table: [] for table in TABLES}
         for i, (agent, view) in enumerate(zip(env.agents, views, strict=True)):
-            seen = observations[agent]
-            image = cv2.imencode(".png", cv2.cvtColor(seen["image"], cv2.COLOR_RGB2BGR))[1].tobytes()
-            robot = {
-                "time": snapshot.time,
-                "robot": agent,
-                "pose": _flat(seen["pose"]),
-                "pose_truth": _flat(truth.T_world_camera[i]),
-                "odometry": _flat(seen["odometry"]),
-                "intrinsics": _flat(seen["intrinsics"]),
-                "up": _flat(seen["up"]),
-                "image": image,
-            }
-            rows.append((robot, _detection_rows(agent, view, identity(view, i, env), place)))
+            rows["robots"].append(_robot_row(env, i, agent, observations[agent]))
+            rows["detections"] += _detection_rows(env, agent, view, identity(view, i, env))
+            rows["objects"] += _object_rows(env, i, agent)
         yield rows
         observations = step_scripted(env)
         step += 1
 
 
-def _detection_rows(agent: str, view: Any, identities: Any, place: dict[int, list[float]]) -> list[dict[str, Any]]:
-    graph = view.detections.graph
+def _robot_row(env: Any, i: int, agent: str, seen: dict[str, Any]) -> dict[str, Any]:
+    import cv2
+
+    image = cv2.imencode(".png", cv2.cvtColor(seen["image"], cv2.COLOR_RGB2BGR))[1].tobytes()
+    return {
+        "time": env.snapshot().time,
+        "robot": agent,
+        "pose_truth": _flat(env.ground_truth().T_world_camera[i]),
+        "image": image,
+    } | {name: _flat(seen[name]) for name in ("pose", "odometry", "intrinsics", "up")}
+
+
+def _detection_rows(env: Any, agent: str, view: Any, identities: NDArray[np.int64]) -> list[dict[str, Any]]:
+    truth, graph, masks = env.ground_truth(), view.detections.graph, view.detections.masks
+    place = dict(zip(truth.identity.tolist(), truth.positions.tolist(), strict=True))
     covariances = graph.full_covariances()
     return [
         {
             "robot": agent,
+            "detection": k,
             "identity": int(identities[k]),
             "position": _flat(graph.positions[k]),
             "position_variance": float(graph.position_variance[k]),
@@ -202,13 +280,39 @@ def _detection_rows(agent: str, view: Any, identities: Any, place: dict[int, lis
             "attribute_variance": float(graph.attribute_variance[k]),
             "covariance": _flat(covariances[k]),
             "box": _flat(view.detections.boxes[k]),
+            "mask": None if masks is None else run_lengths(masks[k]),
             "truth": place.get(int(identities[k])),
         }
         for k in range(len(graph))
     ]
 
 
-def _meta(scene: str, env: Any, settings: Settings) -> dict[str, Any]:
+def _object_rows(env: Any, i: int, agent: str) -> list[dict[str, Any]]:
+    """What the i-th robot's image really shows, of every object with a visible pixel."""
+    truth, instances = env.ground_truth(), env.camera_frames()[i].instances
+    return [
+        {
+            "robot": agent,
+            "identity": int(truth.identity[k]),
+            "class": env.classes[truth.object_class[k]],
+            "position": _flat(truth.positions[k]),
+            "pixels": int(truth.pixels[i, k]),
+            "box": _flat(truth.boxes[i, k]),
+            "mask": run_lengths(instances == k),
+        }
+        for k in np.flatnonzero(truth.pixels[i])
+    ]
+
+
+def run_lengths(mask: NDArray[np.bool_]) -> list[int]:
+    """COCO's run lengths of a mask (H, W): column by column, in turn outside and inside, outside first."""
+    flat = mask.ravel(order="F")
+    changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
+    lengths = np.diff([0, *changes.tolist(), len(flat)]).tolist()
+    return [0, *lengths] if flat[0] else lengths
+
+
+def _head(scene: str, env: Any, settings: Settings) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -219,49 +323,34 @@ def _meta(scene: str, env: Any, settings: Settings) -> dict[str, Any]:
         "pose": "world_from_sensor, row-major 4x4, noisy",
         "pose_std": {"position_m": env.pose_noise.position_m, "heading_rad": env.pose_noise.heading_rad},
         "image_size": [env.width, env.height],
+        "min_pixels": env.min_pixels,
         "source": f"covis record {scene}, preset {scene_preset(scene, settings)}, seed {settings.seed}, "
         f"{settings.perception} perception",
         "licence": "CC0",
     }
 
 
-def _card(meta: dict[str, Any], settings: Settings, episodes: int) -> str:
-    return f"""---
-license: cc0-1.0
-configs:
-- config_name: robots
-  data_files: robots.parquet
-- config_name: detections
-  data_files: detections.parquet
----
-
-# {meta["name"]}
-
-{episodes} episodes made by `{meta["source"]}`.
-
-`robots.parquet` has a row per robot and frame (noisy pose, true pose, odometry, intrinsics, PNG image),
-`detections.parquet` a row per detection (position and its covariance in the camera frame, class distribution, box;
-truth: identity and position).
-Frames of one episode are consecutive in time. Columns and units: dataset format version {VERSION} of covis.
-
-Synthetic; no persons, no places. Detections: {settings.perception} perception.
-"""
+def _sizes(out: Path) -> dict[str, tuple[int, int]]:
+    """Rows and bytes of each table."""
+    files = {table: out / f"{table}.parquet" for table in TABLES}
+    return {table: (pq.read_metadata(file).num_rows, file.stat().st_size) for table, file in files.items()}
 
 
 def _concatenate(parts: Sequence[Path], file: Path, schema: pa.Schema) -> None:
-    temporary = file.with_suffix(".tmp")
-    with pq.ParquetWriter(temporary, schema) as writer:
+    """One row group an episode; each page has a checksum of its own, so that readers notice damage by themselves."""
+    temporary = file.with_name(f"{file.name}.{os.getpid()}.tmp")
+    with pq.ParquetWriter(temporary, schema, write_page_checksum=True) as writer:
         for part in parts:
             writer.write_table(pq.read_table(part, schema=schema))
     os.replace(temporary, file)
 
 
-def _checksums(out: Path, meta: bytes) -> dict[str, str]:
-    sums = {f"{name}.parquet": _sha256(out / f"{name}.parquet") for name in TABLES}
-    return sums | {"dataset.json": hashlib.sha256(meta).hexdigest()}
+def _checksums(out: Path, head: bytes) -> dict[str, str]:
+    sums = {f"{table}.parquet": sha256(out / f"{table}.parquet") for table in TABLES}
+    return sums | {HEAD: hashlib.sha256(head).hexdigest()}
 
 
-def _sha256(file: Path) -> str:
+def sha256(file: Path) -> str:
     with file.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 

@@ -99,6 +99,7 @@ def _match_all(
             frame=frame.index,
             source=source.robot,
             partner=target.robot,
+            visible=_n_visible(source, target),
             **_common(source, target, matching),
         )
         yield record, matching.pairs
@@ -114,3 +115,10 @@ def _common(source: View, target: View, matching: Matching) -> dict[str, list[An
     right = matching.pairs[is_correct(matching, source.identity, target.identity), 0]
     found = np.isin(shared[real], source.identity[right])
     return {"common_range_m": distance.tolist(), "common_found": found.tolist()}
+
+
+def _n_visible(source: View, target: View) -> int | None:
+    """Objects that both images show, detected or not; None where the dataset does not say."""
+    if source.visible is None or target.visible is None:
+        return None
+    return len(np.intersect1d(source.visible, target.visible))

@@ -7,6 +7,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from covis.evaluation.dataset_check import check
 from covis.evaluation.datasets import DatasetError, load_dataset, pose_covariance, prior_between, true_relative_pose
 from covis.matching.pose import transform
 
@@ -24,6 +25,21 @@ def edit(**values):
         return rows
 
     return change
+
+
+def each(of=None, **values):
+    """Changes every row, or those whose numbers are given."""
+    return lambda rows: [row | values if of is None or k in of else row for k, row in enumerate(rows)]
+
+
+def moved(metres):
+    T = np.eye(4)
+    T[0, 3] = metres
+    return T.ravel().tolist()
+
+
+def ragged_embeddings(rows):
+    return [row | {"embedding": [0.5] * (2 if k == 3 else 4)} for k, row in enumerate(rows)]
 
 
 def drop(column):
@@ -111,12 +127,106 @@ def test_unknown_columns_are_ignored(small_dataset):
         ("detections.parquet", edit(robot="ghost"), "row 0 is of frame 0, robot 'ghost', which robots.parquet lacks"),
         ("robots.parquet", edit(pose=np.diag([2.0, 1, 1, 1]).ravel().tolist()), "column 'pose', row 0: .*rigid motion"),
         ("robots.parquet", lambda rows: [*rows, rows[0]], "repeats frame 0, robot 'robot_0'"),
+        ("robots.parquet", lambda rows: [], "missing column"),
+        ("robots.parquet", edit(frame=-1), "column 'frame', row 0: -1 is less than 0"),
+        ("robots.parquet", edit(frame=0.5), "column 'frame', row 0: 0.5 is not a whole number"),
+        ("robots.parquet", edit(frame=None), "column 'frame', row 0 is null"),
+        ("robots.parquet", edit(robot=None), "column 'robot', row 0 is null"),
+        ("robots.parquet", each(robot=1), "column 'robot' holds int64, not text"),
+        ("robots.parquet", edit(episode=-3), "column 'episode', row 0: -3 is less than 0"),
+        ("robots.parquet", edit(episode=7), "column 'episode', row 1: frame 0 is of episode 7 and of 0"),
+        (
+            "robots.parquet",
+            each(of={6, 7, 10, 11}, episode=0),
+            "column 'episode', row 10: frame 5 goes back to episode 0",
+        ),
+        ("robots.parquet", edit(time=np.inf), "column 'time', row 0: inf is not a time"),
+        ("robots.parquet", each(of={2, 3}, time=-1.0), "column 'time', row 2: frame 1 is at -1.0 s"),
+        ("robots.parquet", each(time="noon"), "column 'time' holds string, not numbers"),
+        ("robots.parquet", edit(pose=moved(1e300)), "column 'pose', row 0: 1e\\+300 is beyond"),
+        ("robots.parquet", edit(pose=moved(np.nan)), "column 'pose', row 0 is not finite"),
+        ("robots.parquet", edit(pose=[1.0] * 15), "column 'pose', row 0 has 15 values, expected 16"),
+        (
+            "robots.parquet",
+            edit(pose_truth=np.diag([-1.0, 1, 1, 1]).ravel().tolist()),
+            "column 'pose_truth', row 0: .*det R",
+        ),
+        ("robots.parquet", each(odometry=[0.0] * 16), "column 'odometry', row 0: .*rigid motion"),
+        ("robots.parquet", each(intrinsics=[0.0] * 9), "column 'intrinsics', row 0: focal lengths"),
+        ("robots.parquet", each(up=[0.0, 0.0, 3.0]), "column 'up', row 0: a unit vector's length is not 3"),
+        ("detections.parquet", edit(frame=99), "row 0 is of frame 99, robot 'robot_0', which robots.parquet lacks"),
+        ("detections.parquet", edit(frame=-1), "column 'frame', row 0: -1 is less than 0"),
+        ("detections.parquet", edit(detection=-1), "column 'detection', row 0: -1 is less than 0"),
+        ("detections.parquet", edit(detection=1), "row 1 repeats frame 0, robot 'robot_0', detection 1"),
+        (
+            "detections.parquet",
+            edit(position=[1.0, 2.0, 1e300]),
+            "column 'position', row 0: 1e\\+300 is beyond 1e\\+07",
+        ),
+        ("detections.parquet", edit(position=[1.0, None, 2.0]), "column 'position', row 0 holds a null"),
+        ("detections.parquet", each(position=None), "column 'position' holds null, not lists"),
+        ("detections.parquet", each(position=["a", "b", "c"]), "column 'position' holds list.*string.*, not numbers"),
+        ("detections.parquet", each(position=1.0), "column 'position' holds double, not lists"),
+        (
+            "detections.parquet",
+            edit(position_variance=np.nan),
+            "column 'position_variance', row 0: nan is not a variance",
+        ),
+        ("detections.parquet", edit(position_variance=1e300), "column 'position_variance', row 0: 1e\\+300"),
+        ("detections.parquet", edit(attribute_variance=-1e-9), "column 'attribute_variance', row 0: -1e-09"),
+        ("detections.parquet", edit(attribute=[np.nan, 0.5, 0.5]), "column 'attribute', row 0 is not finite"),
+        ("detections.parquet", each(attribute=[0.5, 0.5]), "column 'attribute', row 0 has 2 values, expected 3"),
+        ("detections.parquet", each(of={5}, attribute=[0.2] * 5), "column 'attribute', row 5 has 5 values, expected 3"),
+        ("detections.parquet", edit(truth=[1.0, 2.0, np.inf]), "column 'truth', row 0 is not finite"),
+        ("detections.parquet", edit(covariance=[1.0] * 9), "column 'covariance', row 1 is null"),
+        (
+            "detections.parquet",
+            each(covariance=[1.0, 2, 0, 0, 1, 0, 0, 0, 1]),
+            "column 'covariance', row 0: not symmetric",
+        ),
+        (
+            "detections.parquet",
+            each(covariance=[-1.0, 0, 0, 0, 1, 0, 0, 0, 1]),
+            "'covariance', row 0: not positive semi",
+        ),
+        ("detections.parquet", each(box=[5.0, 0, 1, 1]), r"column 'box', row 0: .* is not \[u0, v0, u1, v1\]"),
+        ("detections.parquet", ragged_embeddings, "column 'embedding', row 3 has 2 values, expected 4"),
     ],
 )
 def test_bad_tables_name_file_column_and_row(small_dataset, file, change, message):
     rewrite(small_dataset, file, change)
-    with pytest.raises(DatasetError, match=message):
-        load_dataset(small_dataset)
+    for read in (load_dataset, check):
+        with pytest.raises(DatasetError, match=message) as caught:
+            read(small_dataset)
+        assert str(small_dataset / file) in str(caught.value)
+
+
+def test_bad_true_objects_are_refused_too(small_dataset):
+    head = small_dataset / "dataset.json"
+    head.write_text(json.dumps(json.loads(head.read_text()) | {"min_pixels": 60}))
+    row = {"frame": 0, "robot": "robot_0", "identity": 3, "pixels": 80}
+
+    def write(*rows):
+        pq.write_table(pa.Table.from_pylist(list(rows)), small_dataset / "objects.parquet")
+
+    write(row, row | {"identity": 4, "pixels": 59})
+    views = load_dataset(small_dataset).frame(0).views
+    assert [view.visible.tolist() for view in views] == [[3], []]
+    for wrong, message in (
+        ({"pixels": 0}, "column 'pixels', row 1: 0 is less than 1"),
+        ({"identity": -1}, "column 'identity', row 1: -1"),
+        ({}, "row 1 repeats frame 0, robot 'robot_0', identity 3"),
+        ({"robot": "ghost"}, "row 1 is of frame 0, robot 'ghost'"),
+    ):
+        write(row, row | wrong)
+        with pytest.raises(DatasetError, match=rf"objects.parquet: .*{message}"):
+            load_dataset(small_dataset)
+
+
+def test_unknown_variance_may_be_infinite(small_dataset):
+    rewrite(small_dataset, "detections.parquet", edit(position_variance=np.inf))
+    graph = load_dataset(small_dataset).frame(0).views[0].graph
+    assert np.isinf(graph.position_variance).sum() == 1
 
 
 @pytest.mark.parametrize(
@@ -127,6 +237,15 @@ def test_bad_tables_name_file_column_and_row(small_dataset, file, change, messag
         ({"classes": []}, "classes must be a list of names"),
         ({"units": "cm"}, "units must be 'm'"),
         ({"pose_std": {"position_m": 1}}, "pose_std is malformed"),
+        ({"pose_std": {"position_m": -1, "heading_rad": 0}}, "pose_std is malformed: .*non-negative"),
+        ({"classes": ["a", "b", "a"]}, "classes repeat a name"),
+        ({"classes": "abc"}, "classes must be a list of names"),
+        ({"up": [0, 0]}, "up is malformed"),
+        ({"up": [0, 0, 5]}, "up is malformed: .*unit vector"),
+        ({"image_size": [320]}, "image_size is malformed"),
+        ({"image_size": [320, 0]}, "image_size is malformed"),
+        ({"horizontal_fov_rad": 60}, "horizontal_fov_rad is malformed"),
+        ({"min_pixels": "many"}, "min_pixels is malformed"),
     ],
 )
 def test_bad_heads_are_refused(small_dataset, change, message):
@@ -140,6 +259,9 @@ def test_broken_files_are_refused(small_dataset):
     (small_dataset / "dataset.json").write_text("{")
     with pytest.raises(DatasetError, match="is not JSON"):
         load_dataset(small_dataset)
+    (small_dataset / "dataset.json").write_text("[1]")
+    with pytest.raises(DatasetError, match=r"dataset.json holds list, not an object"):
+        load_dataset(small_dataset)
 
 
 @pytest.mark.parametrize("keep", [0, 100])
@@ -147,6 +269,19 @@ def test_truncated_parquet_is_refused(small_dataset, keep):
     file = small_dataset / "detections.parquet"
     file.write_bytes(file.read_bytes()[:keep])
     with pytest.raises(DatasetError, match=r"detections.parquet cannot be read as Parquet"):
+        load_dataset(small_dataset)
+
+
+def test_corrupt_pages_name_the_column(small_dataset):
+    file = small_dataset / "detections.parquet"
+    pq.write_table(pq.read_table(file), file, write_page_checksum=True, use_dictionary=False)
+    column = pq.read_metadata(file).row_group(0).column(4)
+    assert column.path_in_schema.startswith("position.")
+    content = bytearray(file.read_bytes())
+    at = column.data_page_offset + column.total_compressed_size // 2
+    content[at : at + 4] = bytes(b ^ 0xFF for b in content[at : at + 4])
+    file.write_bytes(content)
+    with pytest.raises(DatasetError, match=r"detections.parquet: column 'position' cannot be read \(corrupt\?\)"):
         load_dataset(small_dataset)
 
 
