@@ -6,6 +6,7 @@ import typer
 
 from .benchmark import benchmark
 from .demo import demo
+from .export_data import app as export_data
 from .import_data import app as import_data
 from .record import check, record
 from .sensitivity import sensitivity
@@ -26,6 +27,7 @@ app.command()(check)
 app.command()(speed)
 app.command()(sensitivity)
 app.add_typer(import_data, name="import")
+app.add_typer(export_data, name="export")
 app.add_typer(train, name="train")
 
 
