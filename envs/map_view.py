@@ -12,27 +12,8 @@ from numpy.typing import NDArray
 
 from ..matching.pose import transform
 from .camera.raster import Look, Rasterizer
-from .paint import (
-    FAINT,
-    INK,
-    PLATE,
-    WRONG,
-    Array,
-    Color,
-    Image,
-    blend,
-    class_color,
-    cross,
-    disc,
-    identity_colors,
-    polygon,
-    polyline,
-    robot_color,
-    round_length,
-    rounded,
-    text,
-    text_width,
-)
+from .colors import FAINT, INK, PLATE, WRONG, Color, class_color, identity_colors, robot_color
+from .paint import Array, Image, blend, cross, disc, polygon, polyline, round_length, rounded, text, text_width
 from .worlds.world import Light, Mesh, Snapshot
 
 if TYPE_CHECKING:

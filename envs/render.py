@@ -10,17 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .claims import Claims
+from .colors import CANVAS, FAINT, IDENTITY_COLORS, INK, RIGHT, WRONG, Color, identity_colors, robot_color
 from .map_view import MapPainter, area_of, matched_identities
 from .paint import (
-    CANVAS,
-    FAINT,
     GAP,
-    IDENTITY_COLORS,
-    INK,
-    RIGHT,
-    WRONG,
     Array,
-    Color,
     Image,
     below,
     beside,
@@ -30,10 +24,8 @@ from .paint import (
     cross,
     dashes,
     disc,
-    identity_colors,
     plate,
     polyline,
-    robot_color,
     text,
     text_width,
 )

@@ -112,6 +112,10 @@ class Dataset:
     def has_poses(self) -> bool:
         return self._robots.get("pose") is not None
 
+    @property
+    def has_true_poses(self) -> bool:
+        return self._robots.get("pose_truth") is not None
+
     def frame(self, i: int) -> Frame:
         """The i-th frame, counted from 0."""
         index = int(self.frame_index[i])

@@ -7,7 +7,7 @@ from importlib.util import find_spec
 EXTRAS = {
     "envs": ("pettingzoo", "gymnasium", "highway_env", "pybullet", "cv2"),
     "learned": ("torch", "safetensors"),
-    "viz": ("matplotlib",),
+    "viz": ("matplotlib", "rerun"),
 }
 
 

@@ -12,6 +12,7 @@ from .record import check, record
 from .sensitivity import sensitivity
 from .speed import speed
 from .train import app as train
+from .view import view
 
 app = typer.Typer(
     name="covis",
@@ -24,6 +25,7 @@ app.command()(demo)
 app.command()(benchmark)
 app.command()(record)
 app.command()(check)
+app.command()(view)
 app.command()(speed)
 app.command()(sensitivity)
 app.add_typer(import_data, name="import")

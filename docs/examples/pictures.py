@@ -10,7 +10,7 @@ from covis.agents.controllers import scripted_controls
 from covis.agents.localizer import Localizer
 from covis.agents.perception import make_perceptor
 from covis.agents.wrapper import LocalizeWrapper
-from covis.envs.paint import CLASS_COLORS, IDENTITY_COLORS, RIGHT, ROBOT_COLORS, WRONG
+from covis.envs.colors import CLASS_COLORS, IDENTITY_COLORS, RIGHT, ROBOT_COLORS, WRONG
 from covis.envs.scenes import SCENES, parallel_env
 
 STEPS = 10

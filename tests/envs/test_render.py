@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from covis.envs import paint
+from covis.envs import colors, paint
 from covis.envs.claims import Claims, claims_to_action
 from covis.envs.map_view import Area, MapPainter, area_of, field_of_view
 from covis.envs.render import compose, draw_correspondences, matched_slots
@@ -77,7 +77,7 @@ def test_any_number_of_robots_and_any_shape_of_image(n_robots, size):
     picture = env.render()
     assert 700 < picture.shape[0] < 900
     for i in range(n_robots):  # every robot's colour is there, in a frame and on the map
-        assert (picture == paint.robot_color(i)).all(axis=-1).sum() > 100
+        assert (picture == colors.robot_color(i)).all(axis=-1).sum() > 100
 
 
 def test_right_and_wrong_matches_are_told_apart():
@@ -90,7 +90,7 @@ def test_right_and_wrong_matches_are_told_apart():
         assert counts.retrieved > 2
         assert counts.correct == (0 if wrong else counts.retrieved)
         pictures[wrong] = env.render()
-    red = {k: (p == paint.WRONG).all(axis=-1).sum() for k, p in pictures.items()}
+    red = {k: (p == colors.WRONG).all(axis=-1).sum() for k, p in pictures.items()}
     assert red[True] > 5 * red[False] + 100
 
 
@@ -126,7 +126,7 @@ def test_correspondences_of_two_cameras():
     env = parallel_env("multi_robot", **MANY)
     env.reset(seed=2)
     images = [f.rgb for f in env.camera_frames()]
-    for wrong, color in ((False, paint.RIGHT), (True, paint.WRONG)):
+    for wrong, color in ((False, colors.RIGHT), (True, colors.WRONG)):
         claims = true_claims(env, wrong)
         picture = draw_correspondences(images, claims, score(claims, env.ground_truth()), "mine")
         assert (picture == color).all(axis=-1).sum() > 50
@@ -192,13 +192,13 @@ class TestMap:
 
 class TestPaint:
     def test_identity_colors_differ_and_stay(self):
-        few = paint.identity_colors([4, 9, 9, 30])
+        few = colors.identity_colors([4, 9, 9, 30])
         assert set(few) == {4, 9, 30}
         assert len(set(few.values())) == 3
-        many = paint.identity_colors(range(14))
+        many = colors.identity_colors(range(14))
         assert len(set(many.values())) == 14
-        assert paint.identity_colors([7]) == {7: paint.identity_colors([7, 100])[7]}
-        assert len(paint.identity_colors(range(50))) == 50
+        assert colors.identity_colors([7]) == {7: colors.identity_colors([7, 100])[7]}
+        assert len(colors.identity_colors(range(50))) == 50
 
     def test_blend_agrees_with_the_formula(self):
         rng = np.random.default_rng(0)

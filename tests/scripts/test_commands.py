@@ -84,3 +84,15 @@ def test_demo_makes_a_report(tmp_path):
     for scene in SCENE_NAMES:
         assert (tmp_path / "pictures" / f"{scene}-oracle.png").stat().st_size > 10_000
         assert f"pictures/{scene}-oracle.png" in report
+
+
+def test_view_writes_a_recording(small_dataset, tmp_path):
+    pytest.importorskip("rerun", reason="rerun-sdk is not installed: pip install covis[viz]")
+    file = tmp_path / "small.rrd"
+    result = runner.invoke(app, ["view", str(small_dataset), "--out", str(file), "--episodes", "1"])
+    assert result.exit_code == 0, result.output
+    assert file.read_bytes().startswith(b"RRF2")
+    assert "3 frames" in result.stdout
+    result = runner.invoke(app, ["view", "nowhere", "--out", str(file)])
+    assert result.exit_code == 2
+    assert "neither a dataset folder nor a scene" in result.stderr
