@@ -32,6 +32,8 @@ TRAIL = 100
 """Instants of a trajectory that are drawn."""
 CHI = 1.0
 """Ellipsoids are drawn at so many standard deviations."""
+MOST_SPREAD_M = 50.0
+"""Larger ellipsoids, of depths that are unknown, would hide everything else."""
 GAP_PX = 8
 MOST_LABELS = 8
 """More labels in one picture would cover one another; they show under the pointer."""
@@ -431,7 +433,7 @@ def _ellipsoids(positions: Array, covariances: Array, colors: Sequence[Any], lab
     vectors[np.linalg.det(vectors) < 0, :, 0] *= -1
     return rr.Ellipsoids3D(
         centers=positions.reshape(-1, 3),
-        half_sizes=CHI * np.sqrt(np.maximum(values, 1e-8)),
+        half_sizes=CHI * np.sqrt(np.clip(values, 1e-8, MOST_SPREAD_M**2)),
         quaternions=_quaternions(vectors),
         colors=colors,
         labels=labels,
