@@ -1,12 +1,13 @@
-"""Targets x methods -> rows."""
+"""Targets x methods, or suites -> rows."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from .comparison import Entry, compared
 from .engine import Results, make_executor, run
 from .experiments import Experiment, target_name, units_of
 from .extras import require
@@ -15,6 +16,8 @@ from .provenance import RENDERER, provenance
 from .records import summarise
 from .settings import SCENE_NAMES, Settings, scene_preset
 from .shards import ROWS, Shards, write_json
+from .statistics import episode_sums
+from .suites import Suite
 
 
 def plan(targets: Sequence[str], methods: Sequence[Method], settings: Settings) -> list[Experiment]:
@@ -38,10 +41,48 @@ def plan(targets: Sequence[str], methods: Sequence[Method], settings: Settings) 
 
 
 def benchmark(
-    targets: Sequence[str],
-    methods: Sequence[Method],
-    settings: Settings,
+    targets: Sequence[str], methods: Sequence[Method], settings: Settings, **how: Any
+) -> list[dict[str, Any]]:
+    """One row per target and method, as docs/reference/commands.md describes.
+
+    Args:
+        targets: see `plan`.
+        methods: see `covis.evaluation.methods`.
+        settings: options of the run.
+        how: see `run_experiments`.
+
+    Raises:
+        ValueError: a target or setting that makes no sense.
+    """
+    for method in methods:
+        method.load()
+    return run_experiments(plan(targets, methods, settings), **how)
+
+
+def benchmark_suite(
+    suite: Suite, methods: Sequence[Method] = (), changes: Mapping[str, Any] | None = None, **how: Any
+) -> list[dict[str, Any]]:
+    """One row per experiment and method of a suite, further `methods` added to its own.
+
+    Args:
+        suite: one of SUITES, or another.
+        methods: added to every experiment.
+        changes: of the suite's settings, e.g. `{"episodes": 1}`; rows show them.
+        how: see `run_experiments`.
+    """
+    experiments = suite.plan([method.label for method in methods], **(changes or {}))
+    if any(e.kind == "scene" for e in experiments):
+        require("envs")
+    if any(e.kind == "scene" and e.settings.perception == "learned" for e in experiments):
+        require("learned")
+    about = {"suite": suite.id, "suite_version": suite.version}
+    return run_experiments(experiments, about=about, **how)
+
+
+def run_experiments(
+    experiments: Sequence[Experiment],
     *,
+    about: Mapping[str, Any] | None = None,
     workers: int = 1,
     engine: str = "local",
     ray_address: str | None = None,
@@ -50,12 +91,11 @@ def benchmark(
     overwrite: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[dict[str, Any]]:
-    """One row per target and method, as docs/reference/commands.md describes.
+    """Rows of experiments.
 
     Args:
-        targets: see `plan`.
-        methods: see `covis.evaluation.methods`.
-        settings: options of the run.
+        experiments: what to run.
+        about: put at the head of every row, and into run.json.
         workers, engine, ray_address: see `covis.evaluation.engine.make_executor`.
         out: folder that keeps records, run.json and rows.json.
         resume: go on with the run in `out`.
@@ -63,26 +103,26 @@ def benchmark(
         progress: called with (units done, units in all).
 
     Raises:
-        ValueError: a target or setting that makes no sense.
         FileExistsError: `out` holds another run, or this one and neither `resume` nor `overwrite` is on.
         UnitFailedError: a part of the work failed again and again; the rest is in `out`.
     """
-    for method in methods:
-        method.load()
+    about = about or {"suite": None}
+    for text in dict.fromkeys(text for experiment in experiments for text in experiment.methods):
+        Method.parse(text).load()
     executor = make_executor(engine, workers, ray_address)
-    experiments = plan(targets, methods, settings)
     units = units_of(experiments)
     session = provenance()
     shards = None if out is None else Shards(out, len(units))
     if shards is not None:
         request = {
+            **about,
             "experiments": [asdict(e) for e in experiments],
             "units": [[u.experiment.id, u.seed, u.episodes] for u in units],
         }
         shards.open(request, session, resume=resume, overwrite=overwrite)
-    about = {"commit": session["commit"]}
-    results = run(units, executor, shards=shards, shared_folder=engine == "local", about=about, progress=progress)
-    rows = [row for experiment in experiments for row in _rows(experiment, results, session["versions"])]
+    noted = {"commit": session["commit"]}
+    results = run(units, executor, shards=shards, shared_folder=engine == "local", about=noted, progress=progress)
+    rows = [{**about, **row} for experiment in experiments for row in _rows(experiment, results, session["versions"])]
     if shards is not None:
         write_json(shards.out / ROWS, {"rows": rows})
     return rows
@@ -90,28 +130,34 @@ def benchmark(
 
 def _rows(experiment: Experiment, results: Results, versions: dict[str, str]) -> list[dict[str, Any]]:
     records = results.records(experiment.id)
-    settings, name = experiment.settings, target_name(experiment)
     # A resumed run may have gone on with other code.
     commits = sorted({facts["commit"] or "unknown" for facts in results.facts(experiment.id)})
-    scene = experiment.kind == "scene"
-    rows = []
+    head = _head(experiment) | {"commit": ", ".join(commits), "versions": versions}
+    entries = []
     for text in experiment.methods:
         method = Method.parse(text)
-        head = {
-            "target": name,
-            "method": method.name,
-            "options": dict(method.options),
-            "pose": settings.pose,
-            "preset": scene_preset(name, settings),
-            "sequence": settings.sequence,
-            "min_common": settings.min_common,
-            "seed": experiment.seeds[0],
-            "seeds": list(experiment.seeds),
-            "experiment": experiment.id,
-            "perception": settings.perception if scene else None,
-            "renderer": RENDERER if scene else None,
-            "commit": ", ".join(commits),
-            "versions": versions,
-        }
-        rows.append(head | summarise([r for r in records if r.method == text]))
-    return rows
+        own = [r for r in records if r.method == text]
+        sums = episode_sums([(r.seed, r.episode) for r in own], [r.counts for r in own])
+        names = {"target": head["target"], "method": method.name, "options": dict(method.options)}
+        more = {"disturbance": method.disturbance.rates(), "episodes": len(sums)}
+        entries.append(Entry(method, names | head | more | summarise(own), sums))
+    return compared(entries)
+
+
+def _head(experiment: Experiment) -> dict[str, Any]:
+    """What all rows of an experiment share."""
+    settings, scene = experiment.settings, experiment.kind == "scene"
+    name = target_name(experiment)
+    return {
+        "target": name,
+        "pose": settings.pose,
+        "preset": scene_preset(name, settings),
+        "sequence": settings.sequence,
+        "min_common": settings.min_common,
+        "seed": experiment.seeds[0],
+        "seeds": list(experiment.seeds),
+        "experiment": experiment.id,
+        "n_robots": settings.n_robots,
+        "perception": settings.perception if scene else None,
+        "renderer": RENDERER if scene else None,
+    }

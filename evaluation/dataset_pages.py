@@ -16,12 +16,15 @@ from .pictures import Page, Result, Sight, recompressed, rounded
 from .records import Record
 
 
-def page(dataset: Dataset, frame: Frame, found: Sequence[tuple[Record, np.ndarray]]) -> Page:
-    """A frame without images; `found` holds every record of the frame with its matched pairs (k, 2)."""
+def page(name: str, frame: Frame, found: Sequence[tuple[Record, np.ndarray]]) -> Page:
+    """A frame of the target called `name`, without images.
+
+    `found` holds every record of the frame with its matched pairs (k, 2).
+    """
     numbers = {view.robot: i for i, view in enumerate(frame.views)}
     methods = dict.fromkeys(record.method for record, _ in found)
     results = [_result(method, [f for f in found if f[0].method == method], numbers) for method in methods]
-    return Page(dataset.name, frame.episode, frame.index, "episode", None, [_sight(v) for v in frame.views], results)
+    return Page(name, frame.episode, frame.index, "episode", None, [_sight(v) for v in frame.views], results)
 
 
 def _sight(view: View) -> Sight:

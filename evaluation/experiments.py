@@ -7,19 +7,23 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal
 
+from . import synthetic
 from .dataset_pages import with_images
 from .datasets import Dataset, load_dataset
 from .methods import Method
 from .pictures import Page, PictureBook
 from .records import Record
-from .run_dataset import run_episodes
+from .run_dataset import run_episodes, run_frames
 from .settings import Settings
 
-Kind = Literal["dataset", "scene"]
+Kind = Literal["dataset", "scene", "synthetic"]
 
 FRAMES_PER_UNIT = 100
 EPISODES_PER_SCENE = 10
 EPISODES_PER_UNIT = 2
+PAIRS = 200
+"""Generated problems of an experiment, unless it says otherwise."""
+PAIRS_PER_UNIT = 50
 
 
 @dataclass(frozen=True)
@@ -28,7 +32,7 @@ class Experiment:
 
     Attributes:
         id: unique in a run.
-        kind: `dataset` (target = folder) or `scene` (target = name).
+        kind: `dataset` (target = folder), `scene` (target = name) or `synthetic` (target = name of a problem).
         target: see `kind`.
         methods: texts of `--method`; all of them see the same frames.
         settings: options; their seed is replaced by each of `seeds`.
@@ -90,7 +94,12 @@ def run_unit(unit: Unit, pictures: bool = False) -> UnitResult:
     """Records of a unit, in order of time, pair and method; with `pictures` also the frames that a report shows."""
     experiment = unit.experiment
     methods = [Method.parse(text) for text in experiment.methods]
-    if experiment.kind == "dataset":
+    if experiment.kind == "synthetic":
+        book = PictureBook(0) if pictures else None
+        frames = synthetic.frames(experiment.target, unit.seed, unit.episodes)
+        records = run_frames(target_name(experiment), frames, methods, unit.settings, book)
+        pages = [] if book is None else book.pages()
+    elif experiment.kind == "dataset":
         data = dataset(experiment.target, unit.seed)
         book = PictureBook(int(data.episode[0])) if pictures else None
         records = run_episodes(data, unit.episodes, methods, unit.settings, book)
@@ -106,17 +115,18 @@ def run_unit(unit: Unit, pictures: bool = False) -> UnitResult:
 
 
 def target_name(experiment: Experiment) -> str:
-    """The name rows carry: a dataset's own, a scene's."""
+    """The name rows carry: a dataset's own, a scene's, `synthetic-...`."""
     if experiment.kind == "dataset":
         return dataset(experiment.target, experiment.seeds[0]).name
-    return experiment.target
+    return f"synthetic-{experiment.target}" if experiment.kind == "synthetic" else experiment.target
 
 
 def _chunks(experiment: Experiment) -> list[tuple[int, ...]]:
     if experiment.kind == "dataset":
         return _by_frames(dataset(experiment.target, experiment.seeds[0]), experiment.settings.episodes)
-    episodes = range(experiment.settings.episodes or EPISODES_PER_SCENE)
-    return [tuple(episodes[k : k + EPISODES_PER_UNIT]) for k in range(0, len(episodes), EPISODES_PER_UNIT)]
+    count, size = (PAIRS, PAIRS_PER_UNIT) if experiment.kind == "synthetic" else (EPISODES_PER_SCENE, EPISODES_PER_UNIT)
+    episodes = range(experiment.settings.episodes or count)
+    return [tuple(episodes[k : k + size]) for k in range(0, len(episodes), size)]
 
 
 def _by_frames(data: Dataset, limit: int | None) -> list[tuple[int, ...]]:

@@ -44,6 +44,8 @@ def match_pair(
         return random_matching(len(source), len(target), rng), 0.0
     matcher = method.load()
     assert matcher is not None
+    if method.disturbance.rates():
+        source, target = disturbed(method, source, target, stream)
     start = perf_counter()
     try:
         if tracker is None:
@@ -65,3 +67,11 @@ def match_pair(
             f"the graphs have {len(source)} and {len(target)} objects"
         )
     return matching, elapsed
+
+
+def disturbed(
+    method: Method, source: ObjectGraph, target: ObjectGraph, stream: tuple[int, ...]
+) -> tuple[ObjectGraph, ObjectGraph]:
+    """The graphs under the method's disturbance, drawn alike for all methods."""
+    rngs = np.random.default_rng([*stream, zlib.crc32(b"disturbance")]).spawn(2)
+    return method.disturbance.apply(source, rngs[0]), method.disturbance.apply(target, rngs[1])

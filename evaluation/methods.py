@@ -11,30 +11,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..matching import Matcher, Matching, load_matcher
+from .disturbance import Disturbance
 
 EVALUATION_ONLY = ("oracle", "random")
 
 
 @dataclass(frozen=True)
 class Method:
-    """A matcher by name, with its options. `label` is the text it came from."""
+    """A matcher by name, with its options. `label` is the text it came from.
+
+    `disturbance` makes the graphs worse that it gets to see, the same way for every method of that disturbance.
+    """
 
     label: str
     name: str
     options: Mapping[str, Any] = field(default_factory=dict)
+    disturbance: Disturbance = field(default_factory=Disturbance)
 
     @classmethod
     def parse(cls, text: str) -> Method:
         """`name`, `name:option=value,...`, `package.module:callable` or `package.module:callable:option=value,...`.
 
+        Each of them may end in a disturbance, `@position_uncertainty=0.1,attribute_noise=0.5`.
+
         Raises:
-            ValueError: an empty name or a malformed option.
+            ValueError: an empty name, a malformed option, an unknown disturbance.
         """
-        head, separator, tail = text.rpartition(":")
-        name, options = (head, tail) if separator and "=" in tail else (text, "")
-        if not name:
-            raise ValueError(f"--method {text!r} names no method")
-        return cls(text, name, _options(options, text))
+        plain, at, disturbance = text.partition("@")
+        head, separator, tail = plain.rpartition(":")
+        name, options = (head, tail) if separator and "=" in tail else (plain, "")
+        if not name or (at and not disturbance):
+            raise ValueError(f"--method {text!r} names no {'disturbance after @' if name else 'method'}")
+        return cls(text, name, _options(options, text), Disturbance.of(_options(disturbance, text)))
 
     def load(self) -> Matcher | None:
         """The matcher, or None for the evaluation-only baselines, which need the truth."""

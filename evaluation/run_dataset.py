@@ -1,8 +1,8 @@
-"""Every method on every pair of views of a dataset folder."""
+"""Every method on every pair of views of given frames: of a dataset folder, or generated."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from itertools import combinations
 from typing import Any
@@ -30,15 +30,26 @@ def run_episodes(
     book: PictureBook | None = None,
 ) -> list[Record]:
     """Records of the given episodes, in order of time, pair and method; `book` gets to see every frame."""
+    chosen = np.flatnonzero(np.isin(dataset.episode, np.asarray(episodes)))
+    return run_frames(dataset.name, (dataset.frame(int(i)) for i in chosen), methods, settings, book)
+
+
+def run_frames(
+    name: str,
+    frames: Iterable[Frame],
+    methods: Sequence[Method],
+    settings: Settings,
+    book: PictureBook | None = None,
+) -> list[Record]:
+    """Records of the frames of the target called `name`, in order of time, pair and method."""
     records: list[Record] = []
     trackers = PairTrackers() if settings.sequence else None
-    for i in np.flatnonzero(np.isin(dataset.episode, np.asarray(episodes))):
-        frame = dataset.frame(int(i))
+    for frame in frames:
         if trackers is not None:
             trackers.begin(frame.episode, {view.robot: view.odometry for view in frame.views})
         found: list[tuple[Record, NDArray[np.int64]]] = []
         for pair in pairs(frame, 0 if trackers is not None else settings.min_common):
-            matched = list(_match_all(dataset, pair, methods, settings, trackers))
+            matched = list(_match_all(name, pair, methods, settings, trackers))
             # A tracker sees every frame; which of them are scored is another matter.
             if n_common(pair[1], pair[2]) >= settings.min_common:
                 found += matched
@@ -47,7 +58,7 @@ def run_episodes(
             counts: dict[str, Counts] = {}
             for record, _ in found:
                 counts[record.method] = counts.get(record.method, Counts()) + record.counts
-            book.see(frame.episode, counts, partial(page, dataset, frame, found))
+            book.see(frame.episode, counts, partial(page, name, frame, found))
     return records
 
 
@@ -66,7 +77,7 @@ def n_common(source: View, target: View) -> int:
 
 
 def _match_all(
-    dataset: Dataset,
+    name: str,
     pair: tuple[Frame, View, View],
     methods: Sequence[Method],
     settings: Settings,
@@ -75,7 +86,7 @@ def _match_all(
     """The record of each method, and its matched pairs (k, 2)."""
     frame, source, target = pair
     prior = prior_between(source, target) if settings.pose == "known" else None
-    where = f"{dataset.name}, frame {frame.index}, {source.robot} and {target.robot}"
+    where = f"{name}, frame {frame.index}, {source.robot} and {target.robot}"
     number = frame.views.index(source) * len(frame.views) + frame.views.index(target)
     for method in methods:
         matching, elapsed = match_pair(
@@ -93,7 +104,7 @@ def _match_all(
             source.identity,
             target.identity,
             elapsed,
-            target=dataset.name,
+            target=name,
             method=method.label,
             episode=frame.episode,
             frame=frame.index,

@@ -76,7 +76,7 @@ def run_episodes(
 def make_env(scene: str, settings: Settings, **options: Any) -> CollaborativeEnv:
     preset = scene_preset(scene, settings)
     sensors = ("image",) if settings.perception == "learned" else ("image", "depth", "instances")
-    return parallel_env(scene, preset=preset, sensors=sensors, **options)
+    return parallel_env(scene, preset=preset, n_robots=settings.n_robots, sensors=sensors, **options)
 
 
 def play(env: CollaborativeEnv, episode: int, methods: Sequence[Method], settings: Settings) -> Iterator[SceneFrame]:

@@ -32,6 +32,7 @@ class Settings:
         seed: of shuffling, scenes and matchers.
         episodes: episodes per scene; on a dataset, the first so many (None = all).
         perception: eyes of the robots in scenes.
+        n_robots: robots with cameras in scenes; None = the scene's own number.
     """
 
     pose: PoseKnowledge = "unknown"
@@ -41,6 +42,7 @@ class Settings:
     seed: int = 0
     episodes: int | None = None
     perception: Perception = "simulated"
+    n_robots: int | None = None
 
     def __post_init__(self) -> None:
         if self.pose not in get_args(PoseKnowledge):
@@ -55,3 +57,5 @@ class Settings:
             raise ValueError(f"seed must be non-negative, got {self.seed}")
         if self.episodes is not None and self.episodes < 1:
             raise ValueError(f"episodes must be at least 1, got {self.episodes}")
+        if self.n_robots is not None and self.n_robots < 2:
+            raise ValueError(f"n_robots must be at least 2, got {self.n_robots}")

@@ -12,8 +12,10 @@ import typer
 from rich.table import Table
 
 from ..evaluation.benchmark import benchmark as run_benchmark
+from ..evaluation.benchmark import benchmark_suite
 from ..evaluation.methods import Method
 from ..evaluation.settings import Settings
+from ..evaluation.suites import SUITES
 from .console import err, fail, out, progress_bar, write_rows
 
 
@@ -23,13 +25,13 @@ def benchmark(
         list[str] | None,
         typer.Option(help="NAME[:option=value,...] or package.module:callable; repeatable. Default: every method."),
     ] = None,
-    pose: Annotated[str, typer.Option(help="unknown | known: hand the noisy poses to the matcher.")] = "unknown",
+    pose: Annotated[str | None, typer.Option(help="unknown | known: hand the noisy poses to the matcher.")] = None,
     preset: Annotated[str | None, typer.Option(help="Difficulty of scenes: easy | paper | hard.")] = None,
-    min_common: Annotated[int, typer.Option(help="Leave out pairs with fewer common objects.")] = 0,
+    min_common: Annotated[int | None, typer.Option(help="Leave out pairs with fewer common objects.")] = None,
     sequence: Annotated[bool, typer.Option("--sequence", help="Carry a tracker through each episode.")] = False,
-    seed: Annotated[int, typer.Option(help="Seed of shuffling, scenes and matchers.")] = 0,
+    seed: Annotated[int | None, typer.Option(help="Seed of shuffling, scenes and matchers.")] = None,
     episodes: Annotated[int | None, typer.Option(help="Episodes per scene, or the first so many of a dataset.")] = None,
-    perception: Annotated[str, typer.Option(help="simulated | learned.")] = "simulated",
+    perception: Annotated[str | None, typer.Option(help="simulated | learned.")] = None,
     workers: Annotated[int, typer.Option(help="Processes; on Ray, units at a time.")] = 1,
     engine: Annotated[str, typer.Option(help="local | ray.")] = "local",
     ray_address: Annotated[str | None, typer.Option(help="A running Ray cluster: auto, or HOST:PORT.")] = None,
@@ -40,28 +42,19 @@ def benchmark(
 ) -> None:
     """Score matchers by precision, recall, F1, calibration and displacement error."""
     if "perception" in targets:
-        _perception(targets, seed, json_target)
+        _perception(targets, seed or 0, json_target)
         return
+    given = {"pose": pose, "preset": preset, "min_common": min_common, "sequence": sequence or None, "seed": seed}
+    changes = {"episodes": episodes, "perception": perception}
+    how = {"workers": workers, "engine": engine, "ray_address": ray_address}
+    how |= {"out": out_dir, "resume": resume, "overwrite": overwrite}
     try:
-        settings = Settings(pose, preset, min_common, sequence, seed, episodes, perception)  # type: ignore[arg-type]
-        methods = [Method.parse(text) for text in method or default_methods(settings)]
         if (resume or overwrite) and out_dir is None:
             raise ValueError(f"{'--resume' if resume else '--overwrite'} needs --out")
         if resume and overwrite:
             raise ValueError("give --resume or --overwrite, not both")
         with progress_bar("benchmark") as progress:
-            rows = run_benchmark(
-                targets,
-                methods,
-                settings,
-                workers=workers,
-                engine=engine,
-                ray_address=ray_address,
-                out=out_dir,
-                resume=resume,
-                overwrite=overwrite,
-                progress=progress,
-            )
+            rows = _run(targets, method or [], _only(given), _only(changes), how | {"progress": progress})
     except (ValueError, RuntimeError, OSError) as error:
         fail(error)
     except KeyboardInterrupt:
@@ -69,6 +62,28 @@ def benchmark(
     write_rows(rows, json_target)
     if json_target != "-":
         out.print(table(rows))
+
+
+def _run(
+    targets: list[str], texts: list[str], given: dict[str, Any], changes: dict[str, Any], how: dict[str, Any]
+) -> list[dict[str, Any]]:
+    """A suite alone, or targets under `given` and `changes` as settings; a suite takes no more than `changes`."""
+    methods = [Method.parse(text) for text in texts]
+    suites = [target for target in targets if target in SUITES]
+    if not suites:
+        settings = Settings(**given, **changes)
+        methods = methods or [Method.parse(text) for text in default_methods(settings)]
+        return run_benchmark(targets, methods, settings, **how)
+    if len(targets) > 1:
+        raise ValueError(f"a suite is run alone, got the targets {' '.join(targets)}")
+    if given:
+        raise ValueError(f"the suite {suites[0]} fixes {', '.join(given)}: leave the option away")
+    return benchmark_suite(SUITES[suites[0]], methods, changes, **how)
+
+
+def _only(options: dict[str, Any]) -> dict[str, Any]:
+    """Those that were given."""
+    return {name: value for name, value in options.items() if value is not None}
 
 
 def _interrupted(out_dir: Path | None) -> NoReturn:
@@ -113,32 +128,53 @@ def default_methods(settings: Settings) -> list[str]:
 
 def table(rows: list[dict[str, Any]]) -> Table:
     """The rows for a person: target, method and the figures that are there."""
-    view = Table(title=None, header_style="bold")
-    columns: list[tuple[str, str, Callable[[Any], str] | None]] = [
-        ("target", "target", str),
-        ("method", "method", str),
-        ("pairs", "pairs", str),
-        ("precision", "precision", "{:.3f}".format),
-        ("recall", "recall", "{:.3f}".format),
-        ("f1", "F1", "{:.3f}".format),
-        ("f1_low", "95 %", None),
-        ("ece", "ECE", "{:.3f}".format),
-        ("displacement_single_m", "single m", "{:.3f}".format),
-        ("displacement_fused_m", "fused m", "{:.3f}".format),
-        ("match_ms", "ms", "{:.2f}".format),
-    ]
-    shown = [c for c in columns if any(row.get(c[0]) is not None for row in rows)]
+    caption = "to best: difference of F1 to the highest; ~ where noise alone may explain it (paired over episodes)"
+    compared = any(row.get("ties_best") is not None for row in rows)
+    view = Table(title=None, header_style="bold", caption=caption if compared else None, caption_justify="left")
+    shown = [column for column in COLUMNS if any(column[2](row) for row in rows)]
     for key, title, _ in shown:
         view.add_column(title, justify="left" if key in ("target", "method") else "right", no_wrap=True)
-    for i, row in enumerate(rows):
-        cells = []
-        for key, _, form in shown:
-            if form is None:
-                cells.append(f"{row['f1_low']:.3f}-{row['f1_high']:.3f}")
-            elif key == "method" and row["options"]:
-                cells.append(row["method"] + ":" + ",".join(f"{k}={v}" for k, v in row["options"].items()))
-            else:
-                cells.append("" if row.get(key) is None else form(row[key]))
-        last = i + 1 == len(rows) or rows[i + 1]["target"] != row["target"]
-        view.add_row(*cells, end_section=last)
+    for row, after in zip(rows, [*rows[1:], None], strict=True):
+        last = after is None or _target(after) != _target(row)
+        view.add_row(*(cell(row) for _, _, cell in shown), end_section=last)
     return view
+
+
+def _target(row: dict[str, Any]) -> str:
+    """The experiment where a suite has several of one target, else the target."""
+    return str(row["experiment"] if row.get("suite") else row["target"])
+
+
+def _method(row: dict[str, Any]) -> str:
+    options = ",".join(f"{k}={v}" for k, v in row["options"].items())
+    disturbance = ",".join(f"{k}={v}" for k, v in row.get("disturbance", {}).items())
+    return row["method"] + (f":{options}" if options else "") + (f"@{disturbance}" if disturbance else "")
+
+
+def _to_best(row: dict[str, Any]) -> str:
+    difference = row.get("f1_minus_best")
+    if difference is None:
+        return ""
+    if difference == 0.0 and row["ties_best"]:
+        return "best"
+    return f"{'~ ' if row['ties_best'] else ''}{difference:+.3f}"
+
+
+def _number(key: str, form: str = "{:.3f}") -> Callable[[dict[str, Any]], str]:
+    return lambda row: "" if row.get(key) is None else form.format(row[key])
+
+
+COLUMNS: tuple[tuple[str, str, Callable[[dict[str, Any]], str]], ...] = (
+    ("target", "target", _target),
+    ("method", "method", _method),
+    ("pairs", "pairs", lambda row: str(row["pairs"])),
+    ("precision", "precision", _number("precision")),
+    ("recall", "recall", _number("recall")),
+    ("f1", "F1", _number("f1")),
+    ("f1_low", "95 %", lambda row: f"{row['f1_low']:.3f}-{row['f1_high']:.3f}"),
+    ("f1_minus_best", "to best", _to_best),
+    ("ece", "ECE", _number("ece")),
+    ("displacement_single_m", "single m", _number("displacement_single_m")),
+    ("displacement_fused_m", "fused m", _number("displacement_fused_m")),
+    ("match_ms", "ms", _number("match_ms", "{:.2f}")),
+)

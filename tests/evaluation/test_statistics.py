@@ -1,0 +1,69 @@
+"""Differences between methods: the episode is the unit, and noise makes no winner."""
+
+import numpy as np
+import pytest
+
+from covis.evaluation.statistics import bootstrap_f1, episode_sums, paired_difference
+from covis.matching.metrics import Counts
+
+
+def sums(correct, retrieved=10, common=10):
+    return {k: np.array([c, retrieved, common], dtype=float) for k, c in enumerate(correct)}
+
+
+def test_sums_pool_by_episode():
+    counts = [Counts(1, 2, 3), Counts(4, 5, 6), Counts(1, 1, 1)]
+    found = episode_sums([(7, 0), (7, 1), (7, 0)], counts)
+    assert {k: v.tolist() for k, v in found.items()} == {(7, 0): [2, 3, 4], (7, 1): [4, 5, 6]}
+
+
+def test_a_difference_by_hand():
+    """F1 = correct / 10 an episode. Ahead by 2 in each of three episodes: of the 8 exchanges two (none, all) make a
+    difference as large, and every resample has the difference .2."""
+    d = paired_difference(sums([8, 5, 6]), sums([6, 3, 4]))
+    assert d.value == pytest.approx(0.2)
+    assert (d.low, d.high) == pytest.approx((0.2, 0.2))
+    assert d.p_value == pytest.approx(2 / 8)
+    assert d.noise  # three episodes never make a winner
+
+
+def test_pairing_sees_what_separate_intervals_hide():
+    rng = np.random.default_rng(0)
+    hard = rng.integers(1, 9, 20)
+    ahead = paired_difference(sums(hard + 1), sums(hard))
+    assert ahead.value == pytest.approx(0.1)
+    assert not ahead.noise
+    assert ahead.p_value < 0.001
+    intervals = [bootstrap_f1(range(20), [Counts(int(c), 10, 10) for c in hard + k]) for k in (0, 1)]
+    assert intervals[0][1] > intervals[1][0]  # they overlap
+
+
+def test_noise_is_called_noise():
+    """Of 100 comparisons of equally good methods, about five p-values fall below .05."""
+    rng = np.random.default_rng(1)
+    p = [
+        paired_difference(sums(rng.binomial(10, 0.5, 9)), sums(rng.binomial(10, 0.5, 9)), samples=50).p_value
+        for _ in range(100)
+    ]
+    assert 0 <= sum(x < 0.05 for x in p) <= 12
+    assert 0.3 < np.median(p) < 0.7
+
+
+def test_many_episodes_are_sampled_and_agree_with_the_exact_test():
+    rng = np.random.default_rng(2)
+    own, other = rng.integers(3, 9, 12), rng.integers(2, 8, 12)
+    exact = paired_difference(sums(own), sums(other)).p_value
+    # A thirteenth episode without a difference doubles every exchange, and the test is sampled.
+    sampled = paired_difference(sums([*own, 5]), sums([*other, 5])).p_value
+    assert sampled == pytest.approx(exact, abs=0.02)
+
+
+def test_equal_methods_do_not_differ():
+    d = paired_difference(sums([3, 4, 5, 6, 7, 8, 2]), sums([3, 4, 5, 6, 7, 8, 2]))
+    assert (d.value, d.low, d.high, d.p_value) == (0.0, 0.0, 0.0, 1.0)
+    assert d.noise
+
+
+def test_episodes_must_be_the_same():
+    with pytest.raises(ValueError, match="same episodes"):
+        paired_difference(sums([1, 2]), sums([1]))
