@@ -71,3 +71,9 @@ def write_dataset(folder: Path, n_frames: int = 6, n_objects: int = 8, seed: int
 @pytest.fixture
 def small_dataset(tmp_path: Path) -> Path:
     return write_dataset(tmp_path / "small")
+
+
+@pytest.fixture
+def dataset_writer():
+    """`write_dataset`, for tests that need other sizes."""
+    return write_dataset
