@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo.utils import BaseParallelWrapper
 
-from ..envs.claims import claims_to_action
+from ..envs.claims import Claims, claims_to_action
 from ..envs.seeding import EpisodeSeeds, Seed
 from .localizer import Localizer
 
@@ -36,7 +36,12 @@ class LocalizeWrapper(BaseParallelWrapper):
         self._control_spaces = {a: env.action_space(a)["control"] for a in env.possible_agents}
         self._seeds = EpisodeSeeds.start(None)
         self._rng: np.random.Generator | None = None
-        self._observations: dict[str, Any] = {}
+        self._claims: list[Claims] = []
+
+    @property
+    def claims(self) -> dict[str, Claims]:
+        """What every robot is about to claim of the last observation: a policy may look at it. Empty before a reset."""
+        return dict(zip(self.env.possible_agents, self._claims, strict=False))
 
     def action_space(self, agent: str) -> spaces.Space:
         return self._control_spaces[agent]
@@ -53,11 +58,15 @@ class LocalizeWrapper(BaseParallelWrapper):
         episode, self._seeds = self._seeds.next()
         # The environment spawns from the episode's seed itself: a key of our own keeps the two streams apart.
         self._rng = np.random.default_rng(np.random.SeedSequence(episode.entropy, spawn_key=(*episode.spawn_key, _KEY)))
-        self._observations = observations
+        self._localize(observations)
         return observations, infos
 
+    def _localize(self, observations: dict[str, Any]) -> None:
+        assert self._rng is not None
+        self._claims = self.localizer.localize([observations[a] for a in self.env.possible_agents], self._rng)
+
     def step(self, actions: dict[str, Any]) -> Any:
-        """Localize on the last observation, claim that, and move.
+        """Claim what the localizer made of the last observation, move, and localize on the next.
 
         Raises:
             ValueError: a control is missing or does not fit; the message names the agent.
@@ -69,16 +78,15 @@ class LocalizeWrapper(BaseParallelWrapper):
         missing = [a for a in agents if a not in actions]
         if missing:
             raise ValueError(f"{missing[0]}: no action given")
-        claims = self.localizer.localize([self._observations[a] for a in agents], self._rng)
         # The control goes through as it came: the environment says what is wrong with it.
-        full = {a: claims_to_action(c, ()) | {"control": actions[a]} for a, c in zip(agents, claims, strict=True)}
+        full = {a: claims_to_action(c, ()) | {"control": actions[a]} for a, c in zip(agents, self._claims, strict=True)}
         result = self.env.step(full)
-        self._observations = result[0]
+        self._localize(result[0])
         return result
 
     def save_state(self) -> Any:
-        """The environment's state and the localizer's random numbers; see `CollaborativeEnv.save_state`."""
-        return self.env.save_state(), copy.deepcopy(self._rng), self._seeds
+        """The environment's state, the localizer's random numbers and claims; see `CollaborativeEnv.save_state`."""
+        return self.env.save_state(), copy.deepcopy(self._rng), self._seeds, list(self._claims)
 
     def restore_state(self, saved: Any) -> Any:
         """Go back to a state of `save_state`; returns observations and infos as they were returned then.
@@ -86,11 +94,11 @@ class LocalizeWrapper(BaseParallelWrapper):
         Raises:
             ValueError: not a state that this wrapper saved.
         """
-        if not (isinstance(saved, tuple) and len(saved) == 3):
+        if not (isinstance(saved, tuple) and len(saved) == 4):
             raise ValueError(f"a state from this wrapper's save_state() is needed, got {type(saved).__name__}")
-        state, rng, self._seeds = saved
+        state, rng, self._seeds, claims = saved
         observations, infos = self.env.restore_state(state)
-        self._rng, self._observations = copy.deepcopy(rng), observations
+        self._rng, self._claims = copy.deepcopy(rng), list(claims)
         return observations, infos
 
 

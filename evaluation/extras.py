@@ -7,6 +7,7 @@ from importlib.util import find_spec
 EXTRAS = {
     "envs": ("pettingzoo", "gymnasium", "highway_env", "pybullet", "cv2"),
     "learned": ("torch", "safetensors"),
+    "policy": ("torch", "stable_baselines3", "supersuit"),
     "viz": ("matplotlib", "rerun"),
 }
 

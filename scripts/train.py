@@ -1,16 +1,19 @@
-"""`covis train`: perception from rendered frames."""
+"""`covis train`: perception from rendered frames, policies from episodes."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.table import Table
 
 from ..evaluation.extras import require
-from .console import err, fail
+from .console import err, fail, progress_bar
+from .console import out as console
 
-app = typer.Typer(help="Train what learns: perception.", no_args_is_help=True)
+app = typer.Typer(help="Train what learns: perception, policies.", no_args_is_help=True)
 
 
 @app.callback()
@@ -55,6 +58,57 @@ def perception(
     except (ValueError, RuntimeError, FileExistsError) as error:
         fail(error)
     err.print(f"{out / 'eyes.safetensors'}: {state.step} steps, {state.images} images; {weights.calibration}")
+
+
+@app.command()
+def policy(
+    scene: Annotated[str, typer.Argument(help="Name of a scene, or package.module:World.")],
+    out: Annotated[Path, typer.Option(help="Folder of the checkpoint, the log, the policy and its evaluation.")],
+    steps: Annotated[int, typer.Option(help="Robot-steps of experience; after --resume they may be more.")] = 50_000,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")] = False,
+    seed: Annotated[int, typer.Option(help="Of episodes, first weights and updates.")] = 0,
+    preset: Annotated[str | None, typer.Option(help="Difficulty: easy | paper | hard.")] = None,
+    method: Annotated[str, typer.Option(help="Matcher behind the claims; it knows the noisy poses.")] = "hungarian",
+    perception: Annotated[str, typer.Option(help="simulated | learned.")] = "simulated",
+    evaluation_episodes: Annotated[int, typer.Option(help="Episodes per controller afterwards; 0 = none.")] = 40,
+) -> None:
+    """Learn to move the robots by PPO, on `control` alone; a localizer claims for the team.
+
+    Killed at any time, the same command with --resume goes on and ends with the same weights. Afterwards the policy
+    is compared with scripted, random and standing robots on episodes it has not seen.
+    """
+    try:
+        require("envs")
+        require("policy")
+        import torch
+
+        from ..evaluation.policy_training import COLUMNS, PolicyParams, evaluate_policy, load_policy, train_policy
+
+        torch.set_num_threads(1)
+        params = PolicyParams(scene, preset, method, perception, steps, seed)
+        file = train_policy(params, out, resume=resume, report=_print_iteration)
+        rows: list[dict[str, Any]] = []
+        if evaluation_episodes:
+            with progress_bar("evaluation") as progress:
+                rows = evaluate_policy(params, load_policy(file), evaluation_episodes, progress)
+    except (ValueError, RuntimeError, FileExistsError) as error:
+        fail(error)
+    if rows:
+        (out / "evaluation.json").write_text(json.dumps({"rows": rows}, indent=1) + "\n", encoding="utf-8")
+        table = Table(header_style="bold")
+        for _, title, _ in COLUMNS:
+            table.add_column(title, justify="left" if title == "controller" else "right")
+        for row in rows:
+            table.add_row(*("" if row[key] is None else form.format(row[key]) for key, _, form in COLUMNS))
+        console.print(table)
+    err.print(f"{file}: trained", soft_wrap=True)
+
+
+def _print_iteration(row: dict[str, float]) -> None:
+    err.print(
+        f"{row['done']:6.1%}  {row['steps']:.0f} robot-steps  return of the last episodes {row['episode_return']:.2f}",
+        highlight=False,
+    )
 
 
 def _print(row: dict[str, Any]) -> None:
