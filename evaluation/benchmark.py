@@ -10,7 +10,7 @@ from typing import Any
 from .comparison import Entry, compared
 from .engine import Results, make_executor, run
 from .experiments import Experiment, target_name, units_of
-from .extras import require
+from .extras import require_scene
 from .methods import Method
 from .provenance import RENDERER, provenance
 from .records import summarise
@@ -31,7 +31,7 @@ def plan(targets: Sequence[str], methods: Sequence[Method], settings: Settings) 
     experiments = []
     for target in dict.fromkeys(targets):
         if target in SCENE_NAMES or (":" in target and not Path(target).exists()):
-            require("envs")
+            require_scene(settings.perception)
             experiments.append(Experiment(target, "scene", target, texts, settings, (settings.seed,)))
         elif Path(target).is_dir():
             experiments.append(Experiment(target, "dataset", target, texts, settings, (settings.seed,)))

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from .benchmark import benchmark
-from .extras import require
+from .extras import require_scene
 from .methods import Method
 from .settings import SCENE_NAMES, Settings
 from .shards import write_atomically
@@ -33,13 +33,13 @@ def demo(
     """Run the demo into a folder: rows.json, report.md and, per scene, pictures of every method's matches.
 
     Raises:
-        MissingExtraError: without the packages of `covis[envs]`.
+        MissingExtraError: without the packages of `covis[envs,learned]`.
     """
-    require("envs")
+    settings = Settings(preset=PRESET, seed=seed, episodes=EPISODES)
+    require_scene(settings.perception)
     from .gallery import Picture, correspondence_pictures
 
     methods = [Method.parse(name) for name in METHODS]
-    settings = Settings(preset=PRESET, seed=seed, episodes=EPISODES)
     n_scenes = len(SCENE_NAMES)
     rows = benchmark(SCENE_NAMES, methods, settings, progress=lambda done, total: progress(done, total + n_scenes))
     pictures: dict[str, list[Picture]] = {}
@@ -47,15 +47,16 @@ def demo(
         progress(n_scenes + i, 2 * n_scenes)
         pictures[scene] = correspondence_pictures(scene, methods, settings, out / "pictures")
     write_atomically(out / "rows.json", json.dumps({"rows": rows}, indent=1).encode())
-    write_atomically(out / "report.md", _report(rows, pictures, out, seed).encode())
+    write_atomically(out / "report.md", _report(rows, pictures, out, settings).encode())
     return rows
 
 
-def _report(rows: Sequence[dict[str, Any]], pictures: dict[str, list[Any]], out: Path, seed: int) -> str:
+def _report(rows: Sequence[dict[str, Any]], pictures: dict[str, list[Any]], out: Path, settings: Settings) -> str:
     lines = [
         "# covis demo",
         "",
-        f"Seed {seed}, preset {PRESET}, {EPISODES} episodes a scene, simulated perception, poses unknown to matchers.",
+        f"Seed {settings.seed}, preset {PRESET}, {EPISODES} episodes a scene, {settings.perception} perception, "
+        "poses unknown to matchers.",
         "Green lines are right matches, dashed red ones wrong; white corners are detections left unmatched.",
     ]
     for scene, shown in pictures.items():

@@ -16,8 +16,15 @@ class MissingExtraError(RuntimeError):
     """A package that an extra brings is not installed."""
 
 
-def require(extra: str) -> None:
-    """Raises MissingExtraError naming the extra and the first missing package."""
+def require(extra: str, otherwise: str = "") -> None:
+    """Raises MissingExtraError naming the extra and the first missing package; `otherwise` is said after that."""
     for module in EXTRAS[extra]:
         if find_spec(module) is None:
-            raise MissingExtraError(f"{module} is missing: install covis[{extra}]")
+            raise MissingExtraError(f"{module} is missing: install covis[{extra}]{otherwise}")
+
+
+def require_scene(perception: str) -> None:
+    """What scenes need: the simulators and, for learned eyes, torch. Raises MissingExtraError."""
+    require("envs")
+    if perception == "learned":
+        require("learned", ", or take the eyes that need no torch: --perception simulated")

@@ -79,9 +79,18 @@ def make_env(scene: str, settings: Settings, **options: Any) -> CollaborativeEnv
     return parallel_env(scene, preset=preset, n_robots=settings.n_robots, sensors=sensors, **options)
 
 
+def make_eyes(settings: Settings, env: CollaborativeEnv) -> Perceptor:
+    """The run's perceptor. Learned eyes compute on one thread: sums of several would depend on their number."""
+    if settings.perception == "learned":
+        import torch
+
+        torch.set_num_threads(1)
+    return make_perceptor(settings.perception, env)
+
+
 def play(env: CollaborativeEnv, episode: int, methods: Sequence[Method], settings: Settings) -> Iterator[SceneFrame]:
     """The frames of one episode; between two of them the environment stands at the instant of the first."""
-    perceive = make_perceptor(settings.perception, env)
+    perceive = make_eyes(settings, env)
     observations, _ = env.reset(seed=[settings.seed, episode])
     trackers = PairTrackers() if settings.sequence else None
     step = 0

@@ -41,7 +41,7 @@ class Settings:
     sequence: bool = False
     seed: int = 0
     episodes: int | None = None
-    perception: Perception = "simulated"
+    perception: Perception = "learned"
     n_robots: int | None = None
 
     def __post_init__(self) -> None:

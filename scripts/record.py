@@ -9,7 +9,7 @@ import typer
 
 from ..evaluation.dataset_check import check as check_folder
 from ..evaluation.datasets import DatasetError
-from ..evaluation.extras import require
+from ..evaluation.extras import require_scene
 from ..evaluation.recording import EPISODES, unfinished
 from ..evaluation.recording import record as record_scene
 from ..evaluation.settings import Settings
@@ -22,14 +22,14 @@ def record(
     episodes: Annotated[int, typer.Option(help="Episodes of 5 s.")] = EPISODES,
     preset: Annotated[str | None, typer.Option(help="Difficulty: easy | paper | hard.")] = None,
     seed: Annotated[int, typer.Option(help="Of scenes and eyes.")] = 0,
-    perception: Annotated[str, typer.Option(help="simulated | learned.")] = "simulated",
+    perception: Annotated[str, typer.Option(help="learned | simulated.")] = "learned",
     workers: Annotated[int, typer.Option(help="Local processes; they change nothing but the time.")] = 1,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with an unfinished recording.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the dataset that the folder holds.")] = False,
 ) -> None:
     """Record episodes of a scene in the dataset format, with images, masks, poses and truth."""
     try:
-        require("envs")
+        require_scene(perception)
         settings = Settings(preset=preset, seed=seed, episodes=episodes, perception=perception)  # type: ignore[arg-type]
         with progress_bar(f"record {scene}") as progress:
             record_scene(

@@ -119,7 +119,10 @@ class LearnedPerception:
         known = weights.classes
         unknown = [c for c in classes if c not in known]
         if unknown or not classes:
-            raise ValueError(f"learned perception does not know the class {unknown or classes!r}; it knows {known}")
+            raise ValueError(
+                f"learned perception does not know the class {unknown or classes!r}; it knows {known}. "
+                "Simulated perception (`--perception simulated`) takes any."
+            )
         self.classes = tuple(classes)
         self._class_index = torch.tensor([known.index(c) for c in classes])
         self.network = build(weights)

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from covis.evaluation import experiments
-from covis.evaluation.benchmark import benchmark
+from covis.evaluation import experiments, extras
+from covis.evaluation.benchmark import benchmark, plan
 from covis.evaluation.datasets import DatasetError, load_dataset
 from covis.evaluation.matching_run import MatcherFailedError
 from covis.evaluation.methods import Method
@@ -183,3 +183,11 @@ def test_gated_assignment_on_development_data(shared_data):
         [str(shared_data / "carla-v2v")], [Method.parse("hungarian")], Settings(pose="known", episodes=6)
     )
     assert row["f1"] > 0.8
+
+
+def test_scenes_need_torch_unless_their_eyes_are_simulated(small_dataset, monkeypatch):
+    monkeypatch.setattr(extras, "find_spec", lambda module: None if module == "torch" else module)
+    with pytest.raises(extras.MissingExtraError, match=r"torch is missing: install covis\[learned\], .*simulated"):
+        plan(["multi_robot"], METHODS, Settings())
+    plan(["multi_robot"], METHODS, Settings(perception="simulated"))
+    plan([str(small_dataset)], METHODS, Settings())

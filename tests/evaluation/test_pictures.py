@@ -77,7 +77,7 @@ def test_found_flags_count_what_was_matched_rightly(small_dataset, tmp_path):
 def test_scene_records_tell_range_and_occlusion_and_pages_carry_images(tmp_path):
     pytest.importorskip("pybullet")
     methods = [Method.parse("oracle")]
-    benchmark(["multi_robot"], methods, Settings(episodes=1, seed=7003), out=tmp_path / "run")
+    benchmark(["multi_robot"], methods, Settings(episodes=1, seed=7003, perception="simulated"), out=tmp_path / "run")
     records = records_from_table(pq.read_table(tmp_path / "run" / "records" / "unit-00000.parquet"))
     assert records
     for record in records:

@@ -19,7 +19,7 @@ from covis.evaluation.recording import record
 from covis.evaluation.settings import Settings
 
 SCENE = "box_world:BoxWorld"
-SETTINGS = Settings(episodes=2)
+SETTINGS = Settings(episodes=2, perception="simulated")
 
 
 def tables(folder):
@@ -51,7 +51,7 @@ def test_a_recording_is_a_dataset(recorded):
 def test_it_scores_as_the_live_scene_does(recorded, pose):
     # Methods that draw nothing and do not mind the order of detections, which the reader shuffles.
     methods = [Method.parse(m) for m in ("oracle", "reid", "bayes", *(["hungarian"] if pose == "known" else []))]
-    live = benchmark([SCENE], methods, Settings(pose=pose, episodes=2))
+    live = benchmark([SCENE], methods, Settings(pose=pose, episodes=2, perception="simulated"))
     offline = benchmark([str(recorded)], methods, Settings(pose=pose))
     same = ("frames", "pairs", "n_correct", "n_retrieved", "n_covisible", "n_visible", "f1", "scene_recall")
     for a, b in zip(live, offline, strict=True):
@@ -106,7 +106,7 @@ def test_interrupted_recordings_end_the_same(recorded, tmp_path, monkeypatch):
     with pytest.raises(FileExistsError, match="give --resume"):
         record(SCENE, SETTINGS, folder)
     with pytest.raises(FileExistsError, match="unfinished recording of"):
-        record(SCENE, Settings(episodes=2, seed=5), folder, resume=True)
+        record(SCENE, Settings(episodes=2, seed=5, perception="simulated"), folder, resume=True)
     record(SCENE, SETTINGS, folder, resume=True)
     assert tables(folder) == tables(recorded)
 
@@ -116,7 +116,7 @@ def test_nothing_is_overwritten_unasked(recorded, tmp_path):
     with pytest.raises(FileExistsError, match="give --overwrite"):
         record(SCENE, SETTINGS, recorded)
     with pytest.raises(FileExistsError, match="give --overwrite"):
-        record(SCENE, Settings(episodes=3), recorded, resume=True)
+        record(SCENE, Settings(episodes=3, perception="simulated"), recorded, resume=True)
     record(SCENE, SETTINGS, recorded, resume=True)
     assert before == {f.name: f.stat().st_mtime_ns for f in recorded.iterdir()}
     (tmp_path / "README.md").write_text("mine")
@@ -127,7 +127,7 @@ def test_nothing_is_overwritten_unasked(recorded, tmp_path):
 
 def test_overwriting_replaces_another_dataset(recorded, tmp_path):
     folder = tmp_path / "again"
-    record(SCENE, Settings(episodes=1, seed=3), folder)
+    record(SCENE, Settings(episodes=1, seed=3, perception="simulated"), folder)
     (folder / "notes.txt").write_text("stay")
     record(SCENE, SETTINGS, folder, overwrite=True)
     for file in recording.FILES:

@@ -17,7 +17,7 @@ def without_time(rows):
 
 @pytest.fixture(scope="module")
 def rows():
-    return benchmark(["multi_robot"], METHODS, Settings(pose="known", episodes=4, seed=7001))
+    return benchmark(["multi_robot"], METHODS, Settings(pose="known", episodes=4, seed=7001, perception="simulated"))
 
 
 def test_two_robots_localise_better_than_one(rows):
@@ -37,12 +37,14 @@ def test_rows_of_scenes(rows):
 
 
 def test_episodes_do_not_depend_on_methods_or_workers(rows):
-    alone = benchmark(["multi_robot"], METHODS[2:], Settings(pose="known", episodes=4, seed=7001), workers=2)
+    alone = benchmark(
+        ["multi_robot"], METHODS[2:], Settings(pose="known", episodes=4, seed=7001, perception="simulated"), workers=2
+    )
     assert without_time(rows)[2:] == without_time(alone)
 
 
 def test_frames_tell_what_each_method_made_of_them():
-    settings = Settings(pose="known", seed=3)
+    settings = Settings(pose="known", seed=3, perception="simulated")
     env = make_env("target_localization", settings, width=160, height=120)
     frame = next(play(env, 0, METHODS, settings))
     env.close()
@@ -55,6 +57,18 @@ def test_frames_tell_what_each_method_made_of_them():
 
 
 def test_sequence_mode_runs_on_scenes():
-    (row,) = benchmark(["multi_robot"], [Method.parse("bayes")], Settings(sequence=True, episodes=1, seed=7001))
+    (row,) = benchmark(
+        ["multi_robot"], [Method.parse("bayes")], Settings(sequence=True, episodes=1, seed=7001, perception="simulated")
+    )
     assert row["sequence"] is True
     assert row["pairs"] > 0
+
+
+def test_eyes_see_pixels_alone_by_default_and_repeat():
+    env = make_env("target_localization", Settings(preset="easy"))
+    assert not {"depth", "instances"} & set(env.observation_space("robot_0").spaces)
+    views = [next(play(env, 0, METHODS[:1], Settings(preset="easy", seed=5))).views for _ in range(2)]
+    env.close()
+    assert sum(len(view.detections) for view in views[0]) > 0
+    for a, b in zip(*views, strict=True):
+        np.testing.assert_array_equal(a.detections.graph.positions, b.detections.graph.positions)
