@@ -71,10 +71,9 @@ def benchmark_suite(
         how: see `run_experiments`.
     """
     experiments = suite.plan([method.label for method in methods], **(changes or {}))
-    if any(e.kind == "scene" for e in experiments):
-        require("envs")
-    if any(e.kind == "scene" and e.settings.perception == "learned" for e in experiments):
-        require("learned")
+    for experiment in experiments:
+        if experiment.kind == "scene":
+            require_scene(experiment.settings.perception)
     about = {"suite": suite.id, "suite_version": suite.version}
     return run_experiments(experiments, about=about, **how)
 
