@@ -13,10 +13,9 @@ from .experiments import Experiment, target_name, units_of
 from .extras import require_scene
 from .methods import Method
 from .provenance import RENDERER, provenance
-from .records import summarise
+from .records import Tally
 from .settings import SCENE_NAMES, Settings, scene_preset
 from .shards import ROWS, Shards, write_json
-from .statistics import episode_sums
 from .suites import Suite
 
 
@@ -128,18 +127,17 @@ def run_experiments(
 
 
 def _rows(experiment: Experiment, results: Results, versions: dict[str, str]) -> list[dict[str, Any]]:
-    records = results.records(experiment.id)
+    found = results.tallies(experiment.id)
     # A resumed run may have gone on with other code.
     commits = sorted({facts["commit"] or "unknown" for facts in results.facts(experiment.id)})
     head = _head(experiment) | {"commit": ", ".join(commits), "versions": versions}
     entries = []
     for text in experiment.methods:
         method = Method.parse(text)
-        own = [r for r in records if r.method == text]
-        sums = episode_sums([(r.seed, r.episode) for r in own], [r.counts for r in own])
+        tally = found.get(text) or Tally.pool([])
         names = {"target": head["target"], "method": method.name, "options": dict(method.options)}
-        more = {"disturbance": method.disturbance.rates(), "episodes": len(sums)}
-        entries.append(Entry(method, names | head | more | summarise(own), sums))
+        row = names | head | {"disturbance": method.disturbance.rates()} | tally.row()
+        entries.append(Entry(method, row, tally.episodes))
     return compared(entries)
 
 

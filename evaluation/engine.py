@@ -31,7 +31,7 @@ from .experiments import Unit, run_unit
 from .extras import MissingExtraError
 from .matching_run import MatcherFailedError
 from .pictures import to_table as pictures_table
-from .records import Record, from_table, to_table
+from .records import Tally, tallies, to_table
 from .shards import PICTURES, RECORDS, Shards, facts, with_facts
 
 ATTEMPTS = 3
@@ -115,9 +115,13 @@ class Results:
     units: tuple[Unit, ...]
     table: Callable[[int], pa.Table]
 
-    def records(self, experiment: str) -> list[Record]:
-        """Records of one experiment, in the order of its units."""
-        return [r for number in self._numbers(experiment) for r in from_table(self.table(number))]
+    def tallies(self, experiment: str) -> dict[str, Tally]:
+        """By method, what rows need of an experiment's records; one unit's records at a time are in memory."""
+        parts: dict[str, list[Tally]] = {}
+        for number in self._numbers(experiment):
+            for method, tally in tallies(self.table(number)).items():
+                parts.setdefault(method, []).append(tally)
+        return {method: Tally.pool(own) for method, own in parts.items()}
 
     def facts(self, experiment: str) -> list[dict[str, Any]]:
         """What was noted about each of its units: `seconds`, and what `run` was told `about` them."""

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
 
 from ..matching.graph import Matching
-from ..matching.metrics import Counts, count, expected_calibration_error, is_correct, pooled
-from .statistics import bootstrap_f1
+from ..matching.metrics import Counts, count, expected_calibration_error, is_correct
+from .statistics import bootstrap_interval
 
 SCHEMA = pa.schema(
     [
@@ -103,38 +105,116 @@ def from_table(table: pa.Table) -> list[Record]:
     return [Record(**row) for row in table.to_pylist()]
 
 
-def summarise(records: Sequence[Record], bootstrap_seed: int = 0) -> dict[str, Any]:
-    """The figures of one row: pooled over the records of one target and one method."""
-    total = pooled([r.counts for r in records])
-    low, high = bootstrap_f1([(r.seed, r.episode) for r in records], [r.counts for r in records], seed=bootstrap_seed)
-    scores = np.array([s for r in records for s in r.scores])
-    hits = np.array([h for r in records for h in r.hits], dtype=bool)
-    row: dict[str, Any] = {
-        "frames": len({(r.seed, r.episode, r.frame) for r in records}),
-        "pairs": len(records),
-        "precision": total.precision,
-        "recall": total.recall,
-        "f1": total.f1,
-        "f1_low": low,
-        "f1_high": high,
-        "ece": _number(expected_calibration_error(scores, hits)),
-        "match_ms": float(np.median([r.match_ms for r in records])) if records else None,
-        "n_correct": total.correct,
-        "n_retrieved": total.retrieved,
-        "n_covisible": total.common,
-    }
-    visible = [r.visible for r in records if r.visible is not None]
-    if visible:
-        n_visible = sum(visible)
-        single = np.array([e for r in records for e in r.error_single_m])
-        fused = np.array([e for r in records for e in r.error_fused_m])
-        row |= {
-            "n_visible": n_visible,
-            "scene_recall": total.correct / n_visible if n_visible else 0.0,
-            "displacement_single_m": float(single.mean()) if len(single) else None,
-            "displacement_fused_m": float(fused.mean()) if len(fused) else None,
+@dataclass(frozen=True, eq=False)
+class Tally:
+    """What rows need of many records of one method: little enough that a million frames fit into memory.
+
+    Attributes:
+        episodes: by seed and episode, how many matches were correct, were retrieved, were there to be found (3,).
+        frames, pairs: how many.
+        match_ms: (pairs,).
+        scores, hits: of all emitted matches.
+        visible: objects that both cameras could see; None where no record knows.
+        errors_m: sums of displacement errors of one robot alone and fused; `n_errors` is their number.
+    """
+
+    episodes: dict[Hashable, NDArray[np.float64]]
+    frames: int
+    pairs: int
+    match_ms: NDArray[np.float64]
+    scores: NDArray[np.float64]
+    hits: NDArray[np.bool_]
+    visible: int | None
+    errors_m: tuple[float, float]
+    n_errors: int
+
+    @classmethod
+    def of(cls, table: pa.Table) -> Tally:
+        """Of records as `to_table` makes them."""
+        where = np.stack([table[key].to_numpy() for key in ("seed", "episode", "frame")], axis=1)
+        counts = np.stack([table[key].to_numpy() for key in ("correct", "retrieved", "common")], axis=1)
+        keys, group = np.unique(where[:, :2], axis=0, return_inverse=True)
+        sums = np.zeros((len(keys), 3))
+        np.add.at(sums, group.ravel(), counts)
+        visible = table["visible"].drop_null()
+        single, fused = _flat(table, "error_single_m"), _flat(table, "error_fused_m")
+        return cls(
+            episodes={(int(seed), int(episode)): row for (seed, episode), row in zip(keys, sums, strict=True)},
+            frames=len(np.unique(where, axis=0)),
+            pairs=len(table),
+            match_ms=table["match_ms"].to_numpy(),
+            scores=_flat(table, "scores"),
+            hits=_flat(table, "hits").astype(bool),
+            visible=int(visible.to_numpy().sum()) if len(visible) else None,
+            errors_m=(float(single.sum()), float(fused.sum())),
+            n_errors=len(single),
+        )
+
+    @classmethod
+    def pool(cls, tallies: Sequence[Tally]) -> Tally:
+        """All of them together; no two of them share a frame."""
+        episodes: dict[Hashable, NDArray[np.float64]] = {}
+        for tally in tallies:
+            for episode, row in tally.episodes.items():
+                episodes[episode] = episodes[episode] + row if episode in episodes else row
+        visible = [tally.visible for tally in tallies if tally.visible is not None]
+        return cls(
+            episodes=episodes,
+            frames=sum(t.frames for t in tallies),
+            pairs=sum(t.pairs for t in tallies),
+            match_ms=np.concatenate([np.zeros(0), *(t.match_ms for t in tallies)]),
+            scores=np.concatenate([np.zeros(0), *(t.scores for t in tallies)]),
+            hits=np.concatenate([np.zeros(0, dtype=bool), *(t.hits for t in tallies)]),
+            visible=sum(visible) if visible else None,
+            errors_m=(sum(t.errors_m[0] for t in tallies), sum(t.errors_m[1] for t in tallies)),
+            n_errors=sum(t.n_errors for t in tallies),
+        )
+
+    def row(self) -> dict[str, Any]:
+        """The figures of one row."""
+        correct, retrieved, common = (int(x) for x in sum(self.episodes.values(), np.zeros(3)))
+        total = Counts(correct, retrieved, common)
+        low, high = bootstrap_interval(self.episodes)
+        row: dict[str, Any] = {
+            "frames": self.frames,
+            "pairs": self.pairs,
+            "episodes": len(self.episodes),
+            "precision": total.precision,
+            "recall": total.recall,
+            "f1": total.f1,
+            "f1_low": low,
+            "f1_high": high,
+            "ece": _number(expected_calibration_error(self.scores, self.hits)),
+            "match_ms": float(np.median(self.match_ms)) if self.pairs else None,
+            "n_correct": correct,
+            "n_retrieved": retrieved,
+            "n_covisible": common,
         }
-    return row
+        if self.visible is not None:
+            single, fused = self.errors_m
+            row |= {
+                "n_visible": self.visible,
+                "scene_recall": correct / self.visible if self.visible else 0.0,
+                "displacement_single_m": single / self.n_errors if self.n_errors else None,
+                "displacement_fused_m": fused / self.n_errors if self.n_errors else None,
+            }
+        return row
+
+
+def tallies(table: pa.Table) -> dict[str, Tally]:
+    """By method, of records as `to_table` makes them."""
+    methods = table["method"].unique().to_pylist()
+    return {method: Tally.of(table.filter(pc.equal(table["method"], method))) for method in methods}
+
+
+def summarise(records: Sequence[Record]) -> dict[str, Any]:
+    """The figures of one row: pooled over the records of one target and one method."""
+    return Tally.of(to_table(records)).row()
+
+
+def _flat(table: pa.Table, column: str) -> NDArray[np.float64]:
+    """The values of a column of lists, one after the other."""
+    return pc.list_flatten(table[column]).to_numpy()
 
 
 def _number(value: float) -> float | None:

@@ -22,10 +22,16 @@ def bootstrap_f1(
     episodes: Sequence[Hashable], counts: Sequence[Counts], samples: int = SAMPLES, level: float = LEVEL, seed: int = 0
 ) -> tuple[float, float]:
     """Percentile interval of the pooled F1 over resampled episodes; (0, 0) without data."""
-    if not counts:
+    return bootstrap_interval(episode_sums(episodes, counts), samples, level, seed)
+
+
+def bootstrap_interval(
+    sums: Mapping[Hashable, Array], samples: int = SAMPLES, level: float = LEVEL, seed: int = 0
+) -> tuple[float, float]:
+    """The same from `episode_sums`."""
+    if not sums:
         return 0.0, 0.0
-    sums = np.array(list(episode_sums(episodes, counts).values()))
-    f1 = _f1(_resamples(len(sums), samples, seed) @ sums)
+    f1 = _f1(_resamples(len(sums), samples, seed) @ np.array(list(sums.values())))
     low, high = np.quantile(f1, [(1 - level) / 2, (1 + level) / 2])
     return float(low), float(high)
 
