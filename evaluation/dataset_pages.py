@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 
-from ..matching.pose import transform
+from ..matching.pose import Array, transform
 from .datasets import Dataset, Frame, View
 from .pictures import Page, Result, Sight, recompressed, rounded
 from .records import Record
@@ -28,20 +28,33 @@ def page(name: str, frame: Frame, found: Sequence[tuple[Record, np.ndarray]]) ->
 
 
 def _sight(view: View) -> Sight:
-    known = view.pose_truth is not None
-    places = transform(view.pose_truth, view.graph.positions) if view.pose_truth is not None else view.graph.positions
+    pose = view.pose_truth
     truth: list[list[float] | None] = []
     if view.truth is not None:
         truth = [rounded(p) if np.isfinite(p).all() else None for p in view.truth]
     return Sight(
         robot=view.robot,
         image=None,
-        pose=rounded(view.pose_truth.ravel()) if known and view.pose_truth is not None else None,
+        pose=None if pose is None else rounded(pose.ravel()),
         boxes=[],
-        places=rounded(places),
+        places=rounded(_levelled(view) if pose is None else transform(pose, view.graph.positions)),
         identity=view.identity.tolist(),
         truth=truth,
     )
+
+
+def _levelled(view: View) -> Array:
+    """Positions (n, 3) m as seen from above by a robot that looks along +y; as they are where `up` is unknown."""
+    up, forward = view.graph.up, view.graph.forward
+    if up is None:
+        return view.graph.positions
+    up = up / np.linalg.norm(up)
+    if forward is None or abs(up @ forward) > 0.99:
+        # Any level direction: nothing says where the robot looks, or it looks straight down.
+        forward = np.eye(3)[int(np.argmin(np.abs(up)))]
+    ahead = forward - (forward @ up) * up
+    ahead /= np.linalg.norm(ahead)
+    return view.graph.positions @ np.stack([np.cross(ahead, up), ahead, up], axis=1)
 
 
 def _result(method: str, found: Sequence[tuple[Record, np.ndarray]], numbers: dict[str, int]) -> Result:

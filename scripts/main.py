@@ -9,6 +9,7 @@ from .demo import demo
 from .export_data import app as export_data
 from .import_data import app as import_data
 from .record import check, record
+from .report import report
 from .sensitivity import sensitivity
 from .speed import speed
 from .train import app as train
@@ -25,6 +26,7 @@ app.command()(demo)
 app.command()(benchmark)
 app.command()(record)
 app.command()(check)
+app.command()(report)
 app.command()(view)
 app.command()(speed)
 app.command()(sensitivity)

@@ -1,0 +1,72 @@
+"""Trajectories: the observers' with the matches between them (the paper's Fig. 9), the targets' (Fig. 10)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from . import topview
+from .curves import section
+from .html import Element, h
+from .leaderboard import key
+from .paper import CASE_STUDY_ERROR_M
+from .run import Entry, Group
+
+
+def figure_9(groups: Sequence[Group]) -> Element | None:
+    panels = [panel for group in groups for entry in _shown(group) if (panel := _observers(group, entry)) is not None]
+    if not panels:
+        return None
+    note = (
+        f"The first episode from above: the two observers’ paths, and at {topview.SHOWN_FRAMES} instants lines from "
+        "each observer to where it alone puts a matched object. Green: right; dashed red joins two places wrongly "
+        "taken for one object. The paper’s Fig. 9."
+    )
+    return section("observers", "Observers and their matches", note, panels)
+
+
+def _shown(group: Group) -> list[Entry]:
+    """The best method, and the paper's."""
+    paper = [e for e in group.entries if e.label == "rgm" and e is not group.best]
+    return [group.best, *paper]
+
+
+def _observers(group: Group, entry: Entry) -> Element | None:
+    figure = topview.observers(group, entry.label)
+    if figure is None:
+        return None
+    caption = h("figcaption", None, h("strong", None, group.name), key(entry.method), entry.label)
+    return h("figure", {"class": "panel", "data-t": group.number, "data-m": entry.method}, figure, caption)
+
+
+def figure_10(groups: Sequence[Group]) -> Element | None:
+    panels = [panel for group in groups for panel in _tracks(group)]
+    if not panels:
+        return None
+    single, fused = (1000 * error for error in CASE_STUDY_ERROR_M)
+    note = (
+        f"Up to {topview.MAX_TRACKS} moving objects of the first episode, in the frames in which the best method "
+        "matched them rightly (the oracle, where the best method followed nothing that moves): as one observer "
+        "estimates them alone, and fused with the other. Black: truth. The paper’s Fig. 10; its case study reports "
+        f"{single:.1f} mm alone and {fused:.1f} mm fused."
+    )
+    return section("trajectories", "Trajectories: truth, one robot, fused", note, panels)
+
+
+def _tracks(group: Group) -> list[Element]:
+    """One panel alone, one fused: by the best method that followed something, the oracle where there is no other."""
+    by_quality = sorted(group.competitors, key=lambda e: -e.f1) + [e for e in group.entries if e.label == "oracle"]
+    for entry in by_quality[:1] + [e for e in by_quality if e.label == "oracle"]:
+        found = topview.tracks(group, entry.label)
+        if found:
+            return [_panel(group, entry, found, which) for which in ("single", "fused")]
+    return []
+
+
+def _panel(group: Group, entry: Entry, found: Sequence[topview.Track], which: str) -> Element:
+    what = "one robot alone" if which == "single" else "fused"
+    index = 0 if which == "single" else 1
+    errors = ", ".join(f"object {t.identity} ({t.observer}) {t.errors[index]:.2f} m" for t in found)
+    words = f"matched by {entry.label}. Mean error: {errors}."
+    caption = h("figcaption", None, h("strong", None, f"{group.name}: {what}"), words)
+    figure = topview.trajectories(group.name, found, which)
+    return h("figure", {"class": "panel", "data-t": group.number}, figure, caption)
