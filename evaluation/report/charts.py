@@ -145,7 +145,7 @@ def marker(method: int | None, u: float, v: float, note: str = "") -> Element:
         "M0-4.8L4.4 0L0 4.8L-4.4 0z",
         "M0 4.4L4.2-3H-4.2z",
         "M-4.2 0L-2.1-3.6H2.1L4.2 0L2.1 3.6H-2.1z",
-        "M-3.2-3.2L0-1.2L3.2-3.2L1.2 0L3.2 3.2L0 1.2L-3.2 3.2L-1.2 0z",
+        "M-4-1.8L-1.8-4L0-2.2L1.8-4L4-1.8L2.2 0L4 1.8L1.8 4L0 2.2L-1.8 4L-4 1.8L-2.2 0z",
         "M-1.4-4.2h2.8v2.8h2.8v2.8h-2.8v2.8h-2.8v-2.8h-2.8v-2.8h2.8z",
     )
     shape = shapes[0 if method is None else method % len(shapes)]

@@ -13,6 +13,8 @@ from .run import Entry, Group
 
 GAP = 6
 MAX_FAILURES = 6
+"""Failures shown of a target, and of all targets together at most ALL_FAILURES: pictures weigh."""
+ALL_FAILURES = 36
 PAPER_ORDER = ("reid", "mos", "rgm", "bayes")
 """Methods of Fig. 6 come first, then the others as they ran."""
 
@@ -147,7 +149,8 @@ def _plate(name: str, offset: float) -> Element:
 
 def failures(groups: Sequence[Group], images: Images) -> Element | None:
     """The worst frames of every target, under the matches of a method that the reader picks."""
-    blocks = [block for group in groups if (block := _failures_of(group, images)) is not None]
+    most = max(1, min(MAX_FAILURES, ALL_FAILURES // len(groups)))
+    blocks = [block for group in groups if (block := _failures_of(group, most, images)) is not None]
     if not blocks:
         return None
     note = (
@@ -163,11 +166,11 @@ def worst_pages(group: Group) -> list[Page]:
     scored = [(r, p) for p in group.pages if p.role == "worst" and (r := p.result(group.best.label)) is not None]
     scored = [(r, p) for r, p in scored if r.counts.f1 < 1]
     scored.sort(key=lambda x: (x[0].counts.f1, -len(x[0].hits)))
-    return [page for _, page in scored[:MAX_FAILURES]]
+    return [page for _, page in scored]
 
 
-def _failures_of(group: Group, images: Images) -> Element | None:
-    pages = worst_pages(group)
+def _failures_of(group: Group, most: int, images: Images) -> Element | None:
+    pages = worst_pages(group)[:most]
     if not pages:
         return None
     name = f"pick-{group.number}"

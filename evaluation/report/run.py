@@ -22,7 +22,6 @@ from ..shards import PICTURES, RECORDS, ROWS, RUN, Shards
 from ..statistics import episode_sums
 from .styles import numbered
 
-
 NEEDED = ("target", "experiment", "method", "options", "episodes", "f1", "f1_low", "f1_high", "ece", "match_ms")
 """Columns of a row without which there is no report."""
 

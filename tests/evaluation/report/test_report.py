@@ -156,6 +156,7 @@ def test_bad_folders_are_named(tmp_path):
     (folder / "rows.json").write_text(rows.replace('"episodes"', '"eps"'))
     with pytest.raises(RunFolderError, match=r"rows\.json: a row of multi_robot has no 'episodes'"):
         write_report(folder)
+    (folder / "rows.json").write_text(rows)
     (folder / "records" / "unit-00000.parquet").write_bytes(b"PAR1 no")
     with pytest.raises(RunFolderError, match=r"unit-00000\.parquet cannot be read as Parquet"):
         write_report(folder)
