@@ -71,8 +71,8 @@ def section(groups: list[Group]) -> Element:
             {"class": "note"},
             "Counts are pooled over pairs of views. Bars are 95 % bootstrap intervals over episodes; “to the best” is "
             "the difference of F1 to the highest on the same episodes, with its interval (paired bootstrap), shaded "
-            "where noise alone may explain it (the interval holds 0, or p of a paired permutation test is .05 or more). "
-            "The oracle and chance do not compete. A diamond marks the paper’s F1, from its mean precision and recall; "
+            "where noise alone may explain it (the interval holds 0, or p of a paired permutation test is .05 or more)."
+            " The oracle and chance do not compete. A diamond is the paper’s F1, from its mean precision and recall; "
             "its scenes are not ours: it shows an order, not a target. Click a header to sort.",
         ),
         glance(groups) if len(groups) > 1 else None,
