@@ -15,7 +15,7 @@ from .methods import Method
 from .provenance import RENDERER, provenance
 from .records import Tally
 from .settings import SCENE_NAMES, Settings, scene_preset
-from .shards import ROWS, Shards, write_json
+from .shards import Shards
 from .suites import Suite
 
 
@@ -122,7 +122,7 @@ def run_experiments(
     results = run(units, executor, shards=shards, shared_folder=engine == "local", about=noted, progress=progress)
     rows = [{**about, **row} for experiment in experiments for row in _rows(experiment, results, session["versions"])]
     if shards is not None:
-        write_json(shards.out / ROWS, {"rows": rows})
+        shards.close(rows, [_cost(experiment, results, rows) for experiment in experiments])
     return rows
 
 
@@ -139,6 +139,18 @@ def _rows(experiment: Experiment, results: Results, versions: dict[str, str]) ->
         row = names | head | {"disturbance": method.disturbance.rates()} | tally.row()
         entries.append(Entry(method, row, tally.episodes))
     return compared(entries)
+
+
+def _cost(experiment: Experiment, results: Results, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """What an experiment has cost: the time of its units, on whichever machine they ran."""
+    facts = results.facts(experiment.id)
+    return {
+        "experiment": experiment.id,
+        "units": len(facts),
+        "frames": max((row["frames"] for row in rows if row["experiment"] == experiment.id), default=0),
+        "seconds": sum(f["seconds"] for f in facts),
+        "cpu_seconds": sum(f["cpu_seconds"] for f in facts),
+    }
 
 
 def _head(experiment: Experiment) -> dict[str, Any]:

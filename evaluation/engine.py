@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
 from multiprocessing import get_context, parent_process
-from time import perf_counter
+from time import perf_counter, process_time
 from typing import Any
 
 import pyarrow as pa
@@ -84,7 +84,7 @@ class RunOne:
         units: all units of the run.
         shards: where to write the tables; None hands them back.
         pictures: also make the frames that a report shows.
-        about: kept in each unit's records, together with the `seconds` it took.
+        about: kept in each unit's records, together with the `seconds` and `cpu_seconds` that it took.
     """
 
     units: tuple[Unit, ...]
@@ -93,11 +93,11 @@ class RunOne:
     about: Mapping[str, Any] = field(default_factory=dict)
 
     def __call__(self, number: int) -> Outcome:
-        start = perf_counter()
+        start, cpu_start = perf_counter(), process_time()
         try:
             result = run_unit(self.units[number], self.pictures)
-            seconds = perf_counter() - start
-            tables = {RECORDS: with_facts(to_table(result.records), seconds=seconds, **self.about)}
+            took = {"seconds": perf_counter() - start, "cpu_seconds": process_time() - cpu_start}
+            tables = {RECORDS: with_facts(to_table(result.records), **took, **self.about)}
             if self.pictures:
                 tables[PICTURES] = pictures_table(result.pages)
             if self.shards is None:
@@ -114,6 +114,7 @@ class Results:
 
     units: tuple[Unit, ...]
     table: Callable[[int], pa.Table]
+    schema: Callable[[int], pa.Schema]
 
     def tallies(self, experiment: str) -> dict[str, Tally]:
         """By method, what rows need of an experiment's records; one unit's records at a time are in memory."""
@@ -124,8 +125,8 @@ class Results:
         return {method: Tally.pool(own) for method, own in parts.items()}
 
     def facts(self, experiment: str) -> list[dict[str, Any]]:
-        """What was noted about each of its units: `seconds`, and what `run` was told `about` them."""
-        return [facts(self.table(number)) for number in self._numbers(experiment)]
+        """What was noted about each of its units: `seconds`, `cpu_seconds`, and what `run` was told `about` them."""
+        return [facts(self.schema(number)) for number in self._numbers(experiment)]
 
     def _numbers(self, experiment: str) -> list[int]:
         return [number for number, unit in enumerate(self.units) if unit.experiment.id == experiment]
@@ -167,7 +168,9 @@ def run(
             kept[number] = tables[RECORDS]
         finished.add(number)
         progress(len(finished), len(units))
-    return Results(units, kept.__getitem__ if shards is None else shards.read)
+    if shards is not None:
+        return Results(units, shards.read, shards.schema)
+    return Results(units, kept.__getitem__, lambda number: kept[number].schema)
 
 
 def _until_done(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -62,12 +62,20 @@ class Shards:
         sessions = [*before.get("sessions", []), dict(session)]
         write_json(file, {"format": "covis-run", "version": 1, "sessions": sessions, "plan": plan})
 
+    def close(self, rows: Sequence[Mapping[str, Any]], cost: Sequence[Mapping[str, Any]]) -> None:
+        """Write rows.json, and what the run has cost into run.json."""
+        write_json(self.out / ROWS, {"rows": rows})
+        write_json(self.out / RUN, json.loads((self.out / RUN).read_text()) | {"cost": cost})
+
     def finished(self) -> set[int]:
         """Numbers of the units whose shard is there and whole; spoilt shards are removed."""
         return {number for number in range(self.n) if self.file(number).exists() and self._whole(number)}
 
     def read(self, number: int, folder: str = RECORDS) -> pa.Table:
         return pq.read_table(self.file(number, folder), page_checksum_verification=True)
+
+    def schema(self, number: int) -> pa.Schema:
+        return pq.read_schema(self.file(number))
 
     def write(self, number: int, tables: Mapping[str, pa.Table]) -> None:
         """The records last: a unit whose records are there is finished."""
@@ -99,9 +107,9 @@ class Shards:
         return True
 
 
-def facts(table: pa.Table) -> dict[str, Any]:
-    """What a unit's table says about its making: `seconds`, `commit`."""
-    return json.loads((table.schema.metadata or {}).get(FACTS, b"{}"))
+def facts(schema: pa.Schema) -> dict[str, Any]:
+    """What the schema of a unit's records says about their making."""
+    return json.loads((schema.metadata or {}).get(FACTS, b"{}"))
 
 
 def with_facts(table: pa.Table, **about: Any) -> pa.Table:

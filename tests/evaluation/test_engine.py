@@ -38,6 +38,9 @@ def test_the_folder_tells_all_about_the_run(finished):
     assert session["versions"]["numpy"]
     assert {"command", "commit", "renderer", "started"} <= set(session)
     assert [u[2] for u in about["plan"]["units"]] == [[0], [1]]
+    (cost,) = about["cost"]
+    assert (cost["units"], cost["frames"]) == (2, 6)
+    assert cost["seconds"] > 0
 
 
 def spoil_truncate(shard):
