@@ -209,7 +209,7 @@ def make_executor(engine: str = "local", workers: int = 1, ray_address: str | No
 
     Args:
         engine: `local` or `ray`.
-        workers: local processes, 1 = this one; on Ray, units at a time.
+        workers: local processes, 1 = this one; on Ray, units at a time, 1 = as many as the cluster has CPUs.
         ray_address: of a running cluster; None starts one here.
 
     Raises:

@@ -8,6 +8,7 @@ EXTRAS = {
     "envs": ("pettingzoo", "gymnasium", "highway_env", "pybullet", "cv2"),
     "learned": ("torch", "safetensors"),
     "policy": ("torch", "stable_baselines3", "supersuit"),
+    "ray": ("ray",),
     "viz": ("matplotlib", "rerun"),
 }
 

@@ -103,7 +103,7 @@ def record(
         ValueError: fewer than one worker.
     """
     episodes = settings.episodes or EPISODES
-    request = {"scene": scene, "preset": settings.preset, "seed": settings.seed, "perception": settings.perception}
+    request = {"scene": scene} | {key: getattr(settings, key) for key in ("preset", "seed", "perception", "n_robots")}
     if not _prepare(out, request, episodes, resume, overwrite):
         return
     env = _own_env(scene, settings)
@@ -235,10 +235,9 @@ def _write_episode(env: Any, episode: int, settings: Settings, parts: Path) -> N
 
 def _frames(env: Any, episode: int, settings: Settings) -> Iterator[Rows]:
     """The rows of each step."""
-    from ..agents.perception import make_perceptor
-    from .run_scene import identity, look_around, step_scripted
+    from .run_scene import identity, look_around, make_eyes, step_scripted
 
-    perceive = make_perceptor(settings.perception, env)
+    perceive = make_eyes(settings, env)
     observations, _ = env.reset(seed=[settings.seed, episode])
     step = 0
     while env.agents:

@@ -32,7 +32,7 @@ def benchmark(
     seed: Annotated[int | None, typer.Option(help="Seed of shuffling, scenes and matchers.")] = None,
     episodes: Annotated[int | None, typer.Option(help="Episodes per scene, or the first so many of a dataset.")] = None,
     perception: Annotated[str | None, typer.Option(help="Eyes in scenes: learned (default) | simulated.")] = None,
-    workers: Annotated[int, typer.Option(help="Processes; on Ray, units at a time.")] = 1,
+    workers: Annotated[int, typer.Option(help="Processes; on Ray, units at a time (1: one per CPU).")] = 1,
     engine: Annotated[str, typer.Option(help="local | ray.")] = "local",
     ray_address: Annotated[str | None, typer.Option(help="A running Ray cluster: auto, or HOST:PORT.")] = None,
     out_dir: Annotated[Path | None, typer.Option("--out", help="Keep the records here; needed to resume.")] = None,

@@ -23,7 +23,7 @@ experiments.FRAMES_PER_UNIT = 3
 
 
 def record_job(out: Path) -> None:
-    record("box_world:BoxWorld", Settings(episodes=3), out, resume=True)
+    record("box_world:BoxWorld", Settings(episodes=3, perception="simulated"), out, resume=True)
 
 
 def benchmark_job(out: Path) -> None:

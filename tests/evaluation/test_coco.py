@@ -19,7 +19,7 @@ from covis.evaluation.settings import Settings
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     folder = tmp_path_factory.mktemp("recorded") / "boxes"
-    record("box_world:BoxWorld", Settings(episodes=1), folder)
+    record("box_world:BoxWorld", Settings(episodes=1, perception="simulated"), folder)
     return folder
 
 
