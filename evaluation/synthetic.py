@@ -9,7 +9,7 @@ degrees; classes are confused.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,8 +76,8 @@ DIFFICULTIES = {
     "moderate": Difficulty(0.5, (0.01, 0.04)),
     "mixed": Difficulty(2.0, (0.01, 0.04), empty_share=0.5),
 }
-RUNTIME_OBJECTS = 15
-"""Objects a view in the problems called `n15`, the size at which the paper states its speed."""
+RUNTIME_OBJECTS, RUNTIME_COMMON = 15, 8
+"""Objects a view, and in both, in the problems called `n15`, the size at which the paper states its speed."""
 
 
 def problem_names() -> list[str]:
@@ -98,9 +98,8 @@ def frames(name: str, seed: int, numbers: Sequence[int]) -> Iterator[Frame]:
 
 
 def _n15(rng: np.random.Generator, number: int) -> Frame:
-    place = replace(PLACES["cad"], common=(RUNTIME_OBJECTS // 3,) * 2)
-    alone = RUNTIME_OBJECTS - RUNTIME_OBJECTS // 3
-    return _frame(place, DIFFICULTIES["hard"], place.common[0], (alone, alone), rng, number)
+    alone = RUNTIME_OBJECTS - RUNTIME_COMMON
+    return _frame(PLACES["cad"], DIFFICULTIES["mid"], RUNTIME_COMMON, (alone, alone), rng, number)
 
 
 def _pair(name: str, rng: np.random.Generator, number: int) -> Frame:
