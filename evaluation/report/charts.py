@@ -154,21 +154,41 @@ def marker(method: int | None, u: float, v: float, note: str = "") -> Element:
 
 
 def _labels(series: Sequence[Series], to_x: Callable[[float], float], to_y: Callable[[float], float]) -> list[Element]:
-    """Names beside the last point of each series, moved apart where they would overlap."""
-    placed: list[tuple[float, float]] = []
+    """Names beside the last point of each series, moved where they would cover another name or mark."""
+    at = {s.name: (to_x(s.points[-1][0]), to_y(s.points[-1][1])) for s in series if s.points}
+    taken = [(u - 5, v - 5, u + 5, v + 5) for u, v in at.values()]
     out: list[Element] = []
-    for s in sorted((s for s in series if s.points), key=lambda s: to_y(s.points[-1][1])):
-        u, v = to_x(s.points[-1][0]), to_y(s.points[-1][1])
-        width = 6.6 * len(s.name)
-        left = u + 8 + width > WIDTH - 2
-        start = u - 8 - width if left else u + 8
-        while any(abs(v - w) < 11 and start < b and a < start + width for (a, b), w in _spans(placed, out)):
-            v += 4
-        placed.append((start, start + width))
-        attributes: dict[str, object] = {"class": "tag", "x": u - 8 if left else u + 8, "y": v + 4, "data-m": s.method}
-        out.append(h("text", attributes | {"text-anchor": "end" if left else "start"}, s.name))
+    for s in sorted((s for s in series if s.points), key=lambda s: at[s.name][1]):
+        u, v = at[s.name]
+        anchor, x, y, box = _free_place(u, v, 6.4 * len(s.name), [b for b in taken if not _inside(u, v, b)])
+        taken.append(box)
+        parts = [h("text", {"class": "tag", "x": x, "y": y + 4, "text-anchor": anchor}, s.name)]
+        if abs(y - v) > 8:
+            parts.insert(0, h("line", {"class": "leader", "x1": u, "y1": v, "x2": x, "y2": y}))
+        out.append(h("g", {"data-m": s.method}, parts))
     return out
 
 
-def _spans(placed: list[tuple[float, float]], drawn: list[Element]) -> list[tuple[tuple[float, float], float]]:
-    return [(span, float(text.get("y", "0")) - 4) for span, text in zip(placed, drawn, strict=True)]
+Box = tuple[float, float, float, float]
+
+
+def _free_place(u: float, v: float, width: float, taken: Sequence[Box]) -> tuple[str, float, float, Box]:
+    """Text anchor, place and box of a name near (u, v): the nearest of several places that covers nothing."""
+    places = []
+    for shift in (0, -11, 11, -22, 22, -33, 33, -44, 44, -55, 55):
+        for anchor, x in (("start", u + 8), ("end", u - 8)):
+            left = x if anchor == "start" else x - width
+            box = (left, v + shift - 5, left + width, v + shift + 5)
+            inside = box[0] >= LEFT and box[2] <= WIDTH - 2 and box[1] >= 2 and box[3] <= HEIGHT - BOTTOM
+            places.append((sum(_overlap(box, b) for b in taken) + 1000 * (not inside), anchor, x, v + shift, box))
+    _, anchor, x, y, box = min(places, key=lambda place: place[0])
+    return anchor, x, y, box
+
+
+def _overlap(a: Box, b: Box) -> float:
+    return max(0.0, min(a[2], b[2]) - max(a[0], b[0])) * max(0.0, min(a[3], b[3]) - max(a[1], b[1]))
+
+
+def _inside(u: float, v: float, box: Box) -> bool:
+    """Whether a box is the point's own mark."""
+    return box == (u - 5, v - 5, u + 5, v + 5)

@@ -212,7 +212,8 @@ def _runtime_panel(group: Group) -> Element:
     timed = [e for e in group.entries if e.row["match_ms"]]
     series = [_timed(e) for e in timed]
     x = log_axis("time a pair, ms", [e.row["match_ms"] for e in timed])
-    return panel(group, chart(f"F1 against time on {group.name}", x, unit_axis("F1"), series))
+    y = linear_axis("F1", [float(e.row["f1_high"]) for e in timed])
+    return panel(group, chart(f"F1 against time on {group.name}", x, y, series))
 
 
 def _timed(e: Entry) -> Series:

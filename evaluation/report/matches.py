@@ -75,7 +75,12 @@ def _side_by_side(group: Group, page: Page, images: Images) -> Element:
             caption = h("figcaption", None, key(e.method), h("strong", None, e.label), " ", words(result))
             figures.append(h("figure", {"class": "frame", "data-m": e.method}, picture, caption))
     title = h("h3", None, group.name, h("span", {"class": "aka"}, f"episode {page.episode}, frame {page.frame}"))
-    return h("article", {"data-t": group.number}, title, h("div", {"class": "frames"}, figures))
+    return h("article", {"data-t": group.number}, title, strip(figures, f"Matches on {group.name}, method by method"))
+
+
+def strip(figures: list[Element], label: str, classes: str = "frames") -> Element:
+    """Pictures in a grid; on a phone a strip that scrolls sideways, by keyboard as well."""
+    return h("div", {"class": classes, "tabindex": "0", "role": "group", "aria-label": label}, figures)
 
 
 def _rank(entry: Entry) -> int:
@@ -180,10 +185,10 @@ def _failures_of(group: Group, most: int, images: Images) -> Element | None:
     title = h("h3", None, group.name)
     return h(
         "article",
-        {"data-t": group.number, "class": "failures", "data-picked": group.best.method},
+        {"data-t": group.number},
         title,
         picker,
-        h("div", {"class": "frames large"}, figures),
+        strip(figures, f"Failures on {group.name}", "frames large"),
     )
 
 
