@@ -199,7 +199,7 @@ def _failure(group: Group, page: Page, images: Images) -> Element:
     told = [h("span", {"data-pick": method}, words(result)) for method, result in results]
     best = max((r.counts.f1, m) for m, r in results if not group_entry(group, m).baseline)
     others = (
-        f". Best here: {group_entry(group, best[1]).label}, F1 {best[0]:.2f}." if best[0] else ". Nobody does better."
+        f". Best here: {group_entry(group, best[1]).label}, F1 {best[0]:.2f}." if best[0] else ". No method did better."
     )
     caption = h("figcaption", None, h("strong", None, f"episode {page.episode}, frame {page.frame}"), " ", told, others)
     return h("figure", {"class": "frame"}, picture, caption)
