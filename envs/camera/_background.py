@@ -16,12 +16,21 @@ FINE, COARSE = 48.0, 5.0
 NOISE_SHIFT = 4096.0
 """Metres added before indexing the tile, a multiple of its period, so that indices are positive near the origin."""
 
+SHORT_RUN = 8
+"""Bodies that hide fewer pixels of a row than this do not interrupt its colouring."""
+
 FAST = {"contract", "arcp", "nsz"}
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
-def draw_background(camera, light, look, noise, shadow, contact, shadow_spans, rgb, depth, instances):  # type: ignore[no-untyped-def]
-    """Colour (H, 3 W), depth and instance of every pixel, as if there were no bodies but their shadows."""
+def draw_background(  # type: ignore[no-untyped-def]
+    camera, light, look, noise, inverse_depth, spans, shadow, contact, shadow_spans, rgb, depth, instances
+):
+    """Depth and instance of every pixel as if there were no bodies; the colour (H, 3 W) of those that no body hides.
+
+    `inverse_depth`, in the columns `spans` of each row, is that of the bodies; it is set to 0 where they are behind the
+    ground.
+    """
     instances[:] = -1
     height, width = depth.shape
     f32 = np.float32
@@ -41,6 +50,7 @@ def draw_background(camera, light, look, noise, shadow, contact, shadow_spans, r
     from_sky = f32(light[3] * (1.15 + 0.15 * light[2]) / max(lit, 1e-9))
     shades = np.empty(width, np.float32)
     cells = np.empty((2, width), np.uint32)
+    hidden = np.empty(width, np.uint8)
     for row in range(height):
         du, dv = (offset_u - cx) / fx, (row + offset_v - cy) / fy
         ray_x = f32(camera[2] + camera[1] * dv + camera[0] * du)
@@ -56,52 +66,101 @@ def draw_background(camera, light, look, noise, shadow, contact, shadow_spans, r
             last = min(width, ceil(iz_0 / -iz_step))
         elif iz_1 > 0.0:
             first, last = max(0, min(width, floor(-iz_0 / iz_step) + 1)), width
-        if first > 0:
-            _sky(ray_z, step[2], blue, far, rgb[row, : 3 * first], depth[row, :first])
-        if last < width:
-            _sky(ray_z + step[2] * f32(last), step[2], blue, far, rgb[row, 3 * last :], depth[row, last:])
-        if clouds > 0.0 and (first > 0 or last < width):
-            start, stop = (0, first) if first > 0 else (last, width)
-            _clouds(ray_x, ray_y, ray_z, step, start, stop, clouds, noise, rgb[row])
+        c = f32(first)
+        depth[row, :first] = np.inf
+        depth[row, last:] = np.inf
         if last > first:
-            c = f32(first)
-            here = depth[row, first:last]
-            near_first = (ray_x + step[0] * c, ray_y + step[1] * c)
-            if look[3] > 0.0:
-                _smooth_ground(iz_0 + iz_step * c, iz_step, near_first, step, eye, noise, here, shades)
-            else:
-                _ground_cells(iz_0 + iz_step * c, iz_step, near_first, step, eye, here, cells[0], cells[1])
-                _ground_shades(noise, here, cells[0], cells[1], shades)
-            if shadow_spans[row, 1] > 0:
-                start, stop = max(first, shadow_spans[row, 0]), min(last, shadow_spans[row, 1])
-                _shade_ground(row, start, stop, first, from_sky, shadow, contact, shades)
-            _ground_colors(haze, earth, far, shades, here, rgb[row, 3 * first : 3 * last])
+            _ground_depth(iz_0 + iz_step * c, iz_step, depth[row, first:last])
+        near_first = (ray_x + step[0] * c, ray_y + step[1] * c)
+        sky_start, sky_stop = (0, first) if first > 0 else (last, width)
+        _hide(inverse_depth[row], depth[row], hidden, spans[row, 0], spans[row, 1])
+        stop = 0
+        while stop < width:
+            start, stop = _next_run(hidden, stop)
+            if start < first:
+                end = min(stop, first)
+                _sky(ray_z, step[2], blue, far, start, end - start, rgb[row, 3 * start : 3 * end])
+            if stop > last:
+                begin = max(start, last)
+                right = ray_z + step[2] * f32(last)
+                _sky(right, step[2], blue, far, begin - last, stop - begin, rgb[row, 3 * begin : 3 * stop])
+            if clouds > 0.0 and start < sky_stop and stop > sky_start:
+                # Two pixels share one amount, counted from the sky's first.
+                begin = start - ((start - sky_start) & 1) if start > sky_start else sky_start
+                end = min(stop, sky_stop)
+                _clouds(ray_x, ray_y, ray_z, step, begin, end, clouds, noise, rgb[row])
+            begin, end = max(start, first), min(stop, last)
+            if begin < end:
+                here = depth[row, begin:end]
+                if look[3] > 0.0:
+                    _smooth_ground(near_first, step, begin - first, eye, noise, here, shades)
+                else:
+                    _ground_cells(near_first, step, begin - first, eye, here, cells[0], cells[1])
+                    _ground_shades(noise, here, cells[0], cells[1], shades)
+                if shadow_spans[row, 1] > 0:
+                    left, right = max(begin, shadow_spans[row, 0]), min(end, shadow_spans[row, 1])
+                    _shade_ground(row, left, right, begin, from_sky, shadow, contact, shades)
+                _ground_colors(haze, earth, far, shades, here, rgb[row, 3 * begin : 3 * end])
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
-def _sky(ray_z, step_z, blue, far, rgb, depth):  # type: ignore[no-untyped-def]
-    """Part of a row above the horizon; the blue grows with the ray's slope."""
+def _hide(inverse_depth, depth, hidden, start, stop):  # type: ignore[no-untyped-def]
+    """Note in a row which pixels bodies hide, 1 or 0, and take away the bodies that are behind the ground."""
+    one, zero = np.float32(1.0), np.float32(0.0)
+    hidden[:] = 0
+    if start >= stop:
+        return
+    iz, ground, out = inverse_depth[start:stop], depth[start:stop], hidden[start:stop]
+    for c in range(len(out)):
+        before = iz[c] > zero and one / iz[c] <= ground[c]
+        out[c] = before
+        iz[c] = iz[c] if before else zero
+
+
+@njit(cache=True, error_model="numpy")
+def _next_run(hidden, start):  # type: ignore[no-untyped-def]
+    """The next columns (first, last + 1) to colour; short hidden pieces are coloured too."""
+    width = len(hidden)
+    while start < width and hidden[start]:
+        start += 1
+    stop = seen = start
+    while seen < width and seen - stop < SHORT_RUN:
+        if not hidden[seen]:
+            stop = seen + 1
+        seen += 1
+    return start, width if stop == start else stop
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _ground_depth(iz_0, iz_step, depth):  # type: ignore[no-untyped-def]
+    """Depth of part of a row of ground."""
     f32 = np.float32
     for c in range(len(depth)):
-        rise = f32(5.0) * max(ray_z + step_z * f32(c), f32(0.0))
+        depth[c] = f32(1.0) / (iz_0 + iz_step * f32(c))
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _sky(ray_z, step_z, blue, far, start, n, rgb):  # type: ignore[no-untyped-def]
+    """n pixels above the horizon, from column `start`; the blue grows with the ray's slope."""
+    f32 = np.float32
+    for c in range(n):
+        rise = f32(5.0) * max(ray_z + step_z * f32(start + c), f32(0.0))
         share = rise / (f32(1.0) + rise)
         rgb[3 * c] = np.uint8(np.int32(far[0] + share * blue[0]))
         rgb[3 * c + 1] = np.uint8(np.int32(far[1] + share * blue[1]))
         rgb[3 * c + 2] = np.uint8(np.int32(far[2] + share * blue[2]))
-        depth[c] = np.inf
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
-def _ground_cells(iz_0, iz_step, ray, step, eye, depth, fine, coarse):  # type: ignore[no-untyped-def]
-    """Depth of part of a row of ground, and the cells of the noise tile its points fall into."""
+def _ground_cells(ray, step, start, eye, depth, fine, coarse):  # type: ignore[no-untyped-def]
+    """The cells of the noise tile that part of a row of ground, from column `start`, falls into."""
     f32 = np.float32
     size, mask = np.int32(NOISE_SIZE), np.int32(NOISE_SIZE - 1)
     for c in range(len(depth)):
-        z = f32(1.0) / (iz_0 + iz_step * f32(c))
-        depth[c] = z
+        z = depth[c]
         reach = min(z, f32(1e4))
-        x = eye[0] + reach * (ray[0] + step[0] * f32(c))
-        y = eye[1] + reach * (ray[1] + step[1] * f32(c))
+        x = eye[0] + reach * (ray[0] + step[0] * f32(start + c))
+        y = eye[1] + reach * (ray[1] + step[1] * f32(start + c))
         fine[c] = (np.int32(x * f32(FINE)) & mask) + size * (np.int32(y * f32(FINE)) & mask)
         coarse[c] = (np.int32(x * f32(COARSE)) & mask) + size * (np.int32(y * f32(COARSE)) & mask)
 
@@ -116,15 +175,14 @@ def _ground_shades(noise, depth, fine, coarse, shades):  # type: ignore[no-untyp
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
-def _smooth_ground(iz_0, iz_step, ray, step, eye, noise, depth, shades):  # type: ignore[no-untyped-def]
-    """Depth and brightness of part of a row of ground, the noise interpolated where its cells would show."""
+def _smooth_ground(ray, step, start, eye, noise, depth, shades):  # type: ignore[no-untyped-def]
+    """Brightness of part of a row of ground, from column `start`, the noise interpolated where its cells would show."""
     f32 = np.float32
     for c in range(len(depth)):
-        z = f32(1.0) / (iz_0 + iz_step * f32(c))
-        depth[c] = z
+        z = depth[c]
         reach = min(z, f32(1e4))
-        x = eye[0] + reach * (ray[0] + step[0] * f32(c))
-        y = eye[1] + reach * (ray[1] + step[1] * f32(c))
+        x = eye[0] + reach * (ray[0] + step[0] * f32(start + c))
+        y = eye[1] + reach * (ray[1] + step[1] * f32(start + c))
         near = min(f32(6.0) / z, f32(1.0))
         shade = f32(1.0) + _interpolated(x * f32(COARSE), y * f32(COARSE), noise) * (f32(0.06) + f32(0.08) * near)
         if z < f32(5.0):

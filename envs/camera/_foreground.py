@@ -36,7 +36,7 @@ def draw_foreground(  # type: ignore[no-untyped-def]
     depth,
     instances,
 ):
-    """Colour (H, 3 W), depth and instance of the pixels where a body is before the background.
+    """Colour (H, 3 W), depth and instance of the pixels of bodies; `draw_background` took those away that it hides.
 
     Leaves `inverse_depth`, `shadow`, `contact` and both `spans` cleared for the next frame.
     """
@@ -45,102 +45,151 @@ def draw_foreground(  # type: ignore[no-untyped-def]
     one, zero = f32(1.0), f32(0.0)
     haze = f32(light[4])
     metres = f32(1.0 / focal)
-    far_r, far_g, far_b = f32(light[8]), f32(light[9]), f32(light[10])
+    far = (f32(light[8]), f32(light[9]), f32(light[10]))
+    most = f32(255.0)
     scratch = np.empty((5, width), np.float32)
+    bright, own = scratch[BRIGHT], np.empty((3, width), np.float32)
+    red, green, blue = own[0], own[1], own[2]
+    sunny, dark = np.empty(width, np.float32), np.empty(width, np.float32)
     for row in range(height):
-        c, stop = spans[row, 0], spans[row, 1]
+        c, stop = max(spans[row, 0], 0), spans[row, 1]
+        iz, at, ids = inverse_depth[row], triangle_at[row], instances[row]
+        lit = False
         while c < stop:
-            iz = inverse_depth[row, c]
-            if iz == zero:
+            if iz[c] == zero:
                 c += 1
                 continue
-            # A run of pixels of one triangle: what it needs is looked up once.
-            first = c
-            k = triangle_at[row, c]
-            while c < stop and triangle_at[row, c] == k and inverse_depth[row, c] > zero:
-                c += 1
-            r, g, b = triangles[k, 0], triangles[k, 1], triangles[k, 2]
-            instance = np.int32(triangles[k, 3])
-            rich = triangles[k, 4] > zero
-            if rich:
-                _shade_run(row, first, c, k, metres, triangles, inverse_depth, noise, shadow, contact, scratch)
-            for x in range(first, c):
-                iz = inverse_depth[row, x]
-                inverse_depth[row, x] = zero
-                z = one / iz
-                if z > depth[row, x]:
+            segment = c
+            while c < stop and iz[c] > zero:
+                # A run of pixels of one triangle, often short: what it needs is looked up once.
+                first, k = c, at[c]
+                while c < stop and at[c] == k and iz[c] > zero:
+                    c += 1
+                r, g, b, instance = triangles[k, 0], triangles[k, 1], triangles[k, 2], np.int32(triangles[k, 3])
+                kind = int(triangles[k, 4])
+                if kind == 0:
+                    for x in range(first, c):
+                        ids[x], red[x], green[x], blue[x] = instance, r, g, b
                     continue
-                own = iz / (iz + haze)
-                fog = one - own
-                if rich:
-                    own_r = min(r * scratch[BRIGHT, x] * (one - scratch[BLUE, x]), f32(255.0)) * own
-                    own_g = min(g * scratch[BRIGHT, x], f32(255.0)) * own
-                    own_b = min(b * scratch[BRIGHT, x] * (one + scratch[BLUE, x]), f32(255.0)) * own
+                if kind & RECEIVES and not lit:
+                    _light_row(row, shadow, contact, shadow_spans, sunny, dark)
+                    lit = True
+                _brighten_run(row, first, c, triangles[k], kind, iz, sunny, dark, bright)
+                for x in range(first, c):
+                    ids[x] = instance
+                if kind & PATTERNED:
+                    _pattern_run(row, first, c, triangles[k], metres, iz, noise, scratch)
+                    for x in range(first, c):
+                        red[x] = min(r * bright[x] * (one - scratch[BLUE, x]), most)
+                        green[x] = min(g * bright[x], most)
+                        blue[x] = min(b * bright[x] * (one + scratch[BLUE, x]), most)
                 else:
-                    own_r, own_g, own_b = r * own, g * own, b * own
-                rgb[row, 3 * x] = np.uint8(np.int32(own_r + far_r * fog))
-                rgb[row, 3 * x + 1] = np.uint8(np.int32(own_g + far_g * fog))
-                rgb[row, 3 * x + 2] = np.uint8(np.int32(own_b + far_b * fog))
-                depth[row, x] = z
-                instances[row, x] = instance
+                    for x in range(first, c):
+                        red[x], green[x], blue[x] = (
+                            min(r * bright[x], most),
+                            min(g * bright[x], most),
+                            min(b * bright[x], most),
+                        )
+            _compose(
+                haze,
+                far,
+                red[segment:c],
+                green[segment:c],
+                blue[segment:c],
+                iz[segment:c],
+                depth[row, segment:c],
+                rgb[row, 3 * segment : 3 * c],
+            )
         spans[row, 0] = width
         spans[row, 1] = 0
     for row in range(height):
-        for c in range(shadow_spans[row, 0], shadow_spans[row, 1]):
-            shadow[row, c] = 0
-            contact[row, c] = 0
+        first, stop = shadow_spans[row, 0], shadow_spans[row, 1]
+        if first < stop:
+            shadow[row, first:stop] = 0
+            contact[row, first:stop] = 0
         shadow_spans[row, 0] = width
         shadow_spans[row, 1] = 0
 
 
-@njit(cache=True, error_model="numpy", inline="always")
-def _shade_run(row, first, last, k, metres, triangles, inverse_depth, noise, shadow, contact, scratch):  # type: ignore[no-untyped-def]
-    """Brightness and blueness of columns first..last - 1, all of triangle k, into `scratch`."""
-    f32 = np.float32
-    one, zero = f32(1.0), f32(0.0)
-    kind = int(triangles[k, 4])
-    v = f32(row)
-    if kind & SMOOTH:
-        step, start, constant = triangles[k, 5], triangles[k, 6] * v + triangles[k, 7], triangles[k, 8]
-        for c in range(first, last):
-            scratch[BRIGHT, c] = max((step * f32(c) + start) / inverse_depth[row, c] + constant, zero)
-    elif kind & RECEIVES:
-        _receive_run(row, first, last, triangles[k, 5], triangles[k, 6], shadow, contact, scratch)
-    else:
-        for c in range(first, last):
-            scratch[BRIGHT, c] = one
-    for c in range(first, last):
-        scratch[BLUE, c] = zero
-    if kind & PATTERNED:
-        step, start, constant = triangles[k, 9], triangles[k, 10] * v + triangles[k, 11], triangles[k, 12]
-        step_t, start_t, constant_t = triangles[k, 13], triangles[k, 14] * v + triangles[k, 15], triangles[k, 16]
-        for c in range(first, last):
-            z = one / inverse_depth[row, c]
-            scratch[S, c] = (step * f32(c) + start) * z + constant
-            scratch[T, c] = (step_t * f32(c) + start_t) * z + constant_t
-            scratch[SIZE, c] = z * metres
-        _pattern_run(int(triangles[k, 17]), first, last, noise, scratch)
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _compose(haze, far, red, green, blue, inverse_depth, depth, rgb):  # type: ignore[no-untyped-def]
+    """Depth and final colours of pixels beside each other; clears their inverse depth."""
+    one = np.float32(1.0)
+    for c in range(len(depth)):
+        iz = inverse_depth[c]
+        inverse_depth[c] = np.float32(0.0)
+        depth[c] = one / iz
+        own = iz / (iz + haze)
+        fog = one - own
+        # The order decides which product is fused with the sum, and with it a last bit; pictures are frozen.
+        rgb[3 * c] = np.uint8(np.int32(far[0] * fog + red[c] * own))
+        rgb[3 * c + 1] = np.uint8(np.int32(far[1] * fog + green[c] * own))
+        rgb[3 * c + 2] = np.uint8(np.int32(far[2] * fog + blue[c] * own))
 
 
-@njit(cache=True, error_model="numpy", inline="always")
-def _receive_run(row, first, last, sky, sun, shadow, contact, scratch):  # type: ignore[no-untyped-def]
-    """Light from sky and sun on pixels that lie flat on the ground, as `_background` shades the ground itself."""
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _light_row(row, shadow, contact, spans, sunny, dark):  # type: ignore[no-untyped-def]
+    """Share of the sun that reaches flat ground in each pixel of a row, and the darkness about feet."""
     f32 = np.float32
     height, width = shadow.shape
     above, below = max(row - 1, 0), min(row + 1, height - 1)
-    for c in range(first, last):
-        left, right = max(c - 1, 0), min(c + 1, width - 1)
-        covered = shadow[row, c] + shadow[row, left] + shadow[row, right] + shadow[above, c] + shadow[below, c]
-        dark = f32(contact[row, c]) * f32(1.0 / 255.0)
-        from_sun = sun * (f32(1.0) - f32(0.19) * f32(covered)) * (f32(1.0) - f32(0.5) * dark)
-        scratch[BRIGHT, c] = sky * (f32(1.0) - dark) + from_sun
+    sunny[:] = f32(1.0)
+    dark[:] = f32(0.0)
+    first = min(spans[above, 0], min(spans[row, 0], spans[below, 0]))
+    last = max(spans[above, 1], max(spans[row, 1], spans[below, 1]))
+    first, last = max(first - 1, 0), min(last + 1, width)
+    for c in (0, width - 1):
+        if first <= c < last:
+            beside = shadow[row, max(c - 1, 0)] + shadow[row, min(c + 1, width - 1)]
+            covered = shadow[row, c] + shadow[above, c] + shadow[below, c] + beside
+            sunny[c] = f32(1.0) - f32(0.19) * f32(covered)
+            dark[c] = f32(contact[row, c]) * f32(1.0 / 255.0)
+    first, last = max(first, 1), min(last, width - 1)
+    if first >= last:
+        return
+    here, left, right = shadow[row, first:last], shadow[row, first - 1 : last - 1], shadow[row, first + 1 : last + 1]
+    over, under, feet = shadow[above, first:last], shadow[below, first:last], contact[row, first:last]
+    sun, shade = sunny[first:last], dark[first:last]
+    for c in range(len(here)):
+        covered = np.int32(here[c]) + np.int32(left[c]) + np.int32(right[c]) + np.int32(over[c]) + np.int32(under[c])
+        sun[c] = f32(1.0) - f32(0.19) * f32(covered)
+        shade[c] = f32(feet[c]) * f32(1.0 / 255.0)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _pattern_run(pattern, first, last, noise, scratch):  # type: ignore[no-untyped-def]
-    """Multiply the brightness, and set the blueness, of columns first..last - 1 in `scratch`."""
+def _brighten_run(row, first, last, triangle, kind, inverse_depth, sunny, dark, bright):  # type: ignore[no-untyped-def]
+    """Brightness of columns first..last - 1, all of one triangle, before any pattern."""
     f32 = np.float32
     one, zero, half = f32(1.0), f32(0.0), f32(0.5)
+    if kind & SMOOTH:
+        step, start, constant = triangle[5], triangle[6] * f32(row) + triangle[7], triangle[8]
+        for c in range(first, last):
+            bright[c] = max((step * f32(c) + start) / inverse_depth[c] + constant, zero)
+    elif kind & RECEIVES:
+        # Light from sky and sun, as `_background` shades the ground itself.
+        sky, sun = triangle[5], triangle[6]
+        for c in range(first, last):
+            bright[c] = sky * (one - dark[c]) + sun * sunny[c] * (one - half * dark[c])
+    else:
+        for c in range(first, last):
+            bright[c] = one
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _pattern_run(row, first, last, triangle, metres, inverse_depth, noise, scratch):  # type: ignore[no-untyped-def]
+    """Multiply the brightness, and set the blueness, of columns first..last - 1, all of one triangle, in `scratch`."""
+    f32 = np.float32
+    one, zero, half = f32(1.0), f32(0.0), f32(0.5)
+    v = f32(row)
+    step, start, constant = triangle[9], triangle[10] * v + triangle[11], triangle[12]
+    step_t, start_t, constant_t = triangle[13], triangle[14] * v + triangle[15], triangle[16]
+    pattern = int(triangle[17])
+    for c in range(first, last):
+        z = one / inverse_depth[c]
+        scratch[S, c] = (step * f32(c) + start) * z + constant
+        scratch[T, c] = (step_t * f32(c) + start_t) * z + constant_t
+        scratch[SIZE, c] = z * metres
+        scratch[BLUE, c] = zero
     if pattern == GRAIN:
         for c in range(first, last):
             fine = (

@@ -23,6 +23,9 @@ in 6. PATTERNED: coordinates s and t in 9-12 and 13-16, likewise; the pattern in
 OK, TABLE_FULL, NO_MESH, BAD_POSE = 0, 1, 2, 3
 
 SHADOW_RANGE_M = 150.0
+LONG_RUN = 16
+"""Pixels of a row from which vector code is worth its start."""
+
 FLAT_M = 0.12
 """Bodies lower than this (roads, markings, pavements) cast no shadow: they receive it."""
 
@@ -103,28 +106,10 @@ def draw_bodies(  # type: ignore[no-untyped-def]
             eye[j] = -(R[0, j] * t[0] + R[1, j] * t[1] + R[2, j] * t[2])
             sun[j] = pose[0, j] * light[0] + pose[1, j] * light[1] + pose[2, j] * light[2]
             up[j] = pose[2, j]
-        base = first_vertex[mesh]
-        left, right, top, bottom = float(width), 0.0, float(height), 0.0
-        in_front = True
-        for k in range(first_vertex[mesh + 1] - base):
-            px, py, pz = vertices[base + k, 0], vertices[base + k, 1], vertices[base + k, 2]
-            x = R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz + t[0]
-            y = R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz + t[1]
-            z = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz + t[2]
-            projected[k, 0] = x
-            projected[k, 1] = y
-            projected[k, 2] = z
-            if z >= near:
-                iz = 1.0 / z
-                u = fx * x * iz + cx - offset_u
-                v = fy * y * iz + cy - offset_v
-                projected[k, 3] = u
-                projected[k, 4] = v
-                left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
-            else:
-                in_front = False
-                left, right, top, bottom = 0.0, float(width), 0.0, float(height)
-        left, right, top, bottom = max(left, 0.0), min(right, float(width)), max(top, 0.0), min(bottom, float(height))
+        base, end = first_vertex[mesh], first_vertex[mesh + 1]
+        body = projected[:, : end - base]
+        _project(vertices[:, base:end], R, t, camera, body)
+        in_front, left, right, top, bottom = _bounds(body, near, float(width), float(height))
         if left >= right or top >= bottom:
             continue
         for row in range(int(top), ceil(bottom)):
@@ -139,9 +124,9 @@ def draw_bodies(  # type: ignore[no-untyped-def]
             corners = 3
             i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
             if in_front:
-                x0, y0 = projected[i, 3], projected[i, 4]
-                x1, y1 = projected[j, 3], projected[j, 4]
-                x2, y2 = projected[k, 3], projected[k, 4]
+                x0, y0 = projected[3, i], projected[4, i]
+                x1, y1 = projected[3, j], projected[4, j]
+                x2, y2 = projected[3, k], projected[4, k]
                 # Most faces of a far body lie between the sample points.
                 if ceil(min(x0, min(x1, x2))) >= ceil(max(x0, max(x1, x2))):
                     continue
@@ -189,7 +174,7 @@ def draw_bodies(  # type: ignore[no-untyped-def]
                 )
             elif receive and px * up[0] + py * up[1] + pz * up[2] > 0.98:
                 k = base + faces[f, 0]
-                if up[0] * vertices[k, 0] + up[1] * vertices[k, 1] + up[2] * vertices[k, 2] + pose[2, 3] < FLAT_M:
+                if up[0] * vertices[0, k] + up[1] * vertices[1, k] + up[2] * vertices[2, k] + pose[2, 3] < FLAT_M:
                     kind |= RECEIVES
                     lit = 1.0
                     triangles[count, 5] = from_sky
@@ -246,24 +231,12 @@ def draw_shadows(  # type: ignore[no-untyped-def]
         rise = 0.5 * max(point[2] + spheres[mesh, 3], 0.0)
         reach = spheres[mesh, 3] + rise * sqrt(slope_x**2 + slope_y**2)
         _to_camera(point[0] - slope_x * rise, point[1] - slope_y * rise, 0.0, camera, projected, 0)
-        if not _in_view(projected[0, 0], projected[0, 1], projected[0, 2], reach, sides, camera[18]):
+        if not _in_view(projected[0, 0], projected[1, 0], projected[2, 0], reach, sides, camera[18]):
             continue
-        base = first_vertex[mesh]
-        in_front = True
-        left, right, top, bottom = float(width), 0.0, float(height), 0.0
-        for k in range(first_vertex[mesh + 1] - base):
-            px, py, pz = vertices[base + k, 0], vertices[base + k, 1], vertices[base + k, 2]
-            z = max(pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3], 0.0)
-            x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3] - slope_x * z
-            y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3] - slope_y * z
-            _to_camera(x, y, 0.0, camera, projected, k)
-            if projected[k, 2] >= camera[18]:
-                u, v = projected[k, 3], projected[k, 4]
-                left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
-            else:
-                in_front = False
-                left, right, top, bottom = 0.0, float(width), 0.0, float(height)
-        left, right, top, bottom = max(left, 0.0), min(right, float(width)), max(top, 0.0), min(bottom, float(height))
+        base, end = first_vertex[mesh], first_vertex[mesh + 1]
+        body = projected[:, : end - base]
+        _project_shadow(vertices[:, base:end], pose, slope_x, slope_y, camera, body)
+        in_front, left, right, top, bottom = _bounds(body, camera[18], float(width), float(height))
         if left >= right or top >= bottom:
             continue
         for row in range(int(top), ceil(bottom)):
@@ -278,9 +251,9 @@ def draw_shadows(  # type: ignore[no-untyped-def]
                 continue
             i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
             if in_front:
-                x0, y0 = projected[i, 3], projected[i, 4]
-                x1, y1 = projected[j, 3], projected[j, 4]
-                x2, y2 = projected[k, 3], projected[k, 4]
+                x0, y0 = projected[3, i], projected[4, i]
+                x1, y1 = projected[3, j], projected[4, j]
+                x2, y2 = projected[3, k], projected[4, k]
                 if ceil(min(y0, min(y1, y2))) < ceil(max(y0, max(y1, y2))):
                     _fill_mask(x0, y0, x1, y1, x2, y2, shadow)
                 continue
@@ -348,6 +321,65 @@ def _draw_contact(extent, pose, strength, camera, projected, polygon, contact, s
             )
 
 
+@njit(cache=True, error_model="numpy")
+def _project(vertices, R, t, camera, out):  # type: ignore[no-untyped-def]
+    """Camera coordinates and pixels (5, v) of a body's vertices (3, v); pixels count beyond the near plane only."""
+    fx, fy, cx, cy, offset_u, offset_v = camera[12], camera[13], camera[14], camera[15], camera[16], camera[17]
+    r00, r01, r02, r10, r11, r12 = R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2]
+    r20, r21, r22, t0, t1, t2 = R[2, 0], R[2, 1], R[2, 2], t[0], t[1], t[2]
+    for k in range(vertices.shape[1]):
+        px, py, pz = vertices[0, k], vertices[1, k], vertices[2, k]
+        x = r00 * px + r01 * py + r02 * pz + t0
+        y = r10 * px + r11 * py + r12 * pz + t1
+        z = r20 * px + r21 * py + r22 * pz + t2
+        iz = 1.0 / z
+        out[0, k] = x
+        out[1, k] = y
+        out[2, k] = z
+        out[3, k] = fx * x * iz + cx - offset_u
+        out[4, k] = fy * y * iz + cy - offset_v
+
+
+@njit(cache=True, error_model="numpy")
+def _project_shadow(vertices, pose, slope_x, slope_y, camera, out):  # type: ignore[no-untyped-def]
+    """Like `_project`, of the vertices' shadows on the ground."""
+    p00, p01, p02, p03 = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
+    p10, p11, p12, p13 = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
+    p20, p21, p22, p23 = pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3]
+    c0, c1, c2, c3, c4, c5 = camera[0], camera[1], camera[2], camera[3], camera[4], camera[5]
+    c6, c7, c8, eye_x, eye_y, below = camera[6], camera[7], camera[8], camera[9], camera[10], 0.0 - camera[11]
+    fx, fy, cx, cy, offset_u, offset_v = camera[12], camera[13], camera[14], camera[15], camera[16], camera[17]
+    for k in range(vertices.shape[1]):
+        px, py, pz = vertices[0, k], vertices[1, k], vertices[2, k]
+        z = max(p20 * px + p21 * py + p22 * pz + p23, 0.0)
+        x = p00 * px + p01 * py + p02 * pz + p03 - slope_x * z - eye_x
+        y = p10 * px + p11 * py + p12 * pz + p13 - slope_y * z - eye_y
+        depth = c2 * x + c5 * y + c8 * below
+        right = c0 * x + c3 * y + c6 * below
+        down = c1 * x + c4 * y + c7 * below
+        out[0, k] = right
+        out[1, k] = down
+        out[2, k] = depth
+        out[3, k] = fx * right / depth + cx - offset_u
+        out[4, k] = fy * down / depth + cy - offset_v
+
+
+@njit(cache=True, error_model="numpy")
+def _bounds(body, near, width, height):  # type: ignore[no-untyped-def]
+    """Whether a projected body (5, v) is beyond the near plane, and its first and last column and row in the image.
+
+    Part of a body before the near plane may be anywhere.
+    """
+    closest, left, right, top, bottom = body[2, 0], width, 0.0, height, 0.0
+    for k in range(body.shape[1]):
+        closest = min(closest, body[2, k])
+        u, v = body[3, k], body[4, k]
+        left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
+    if closest < near:
+        return False, 0.0, width, 0.0, height
+    return True, max(left, 0.0), min(right, width), max(top, 0.0), min(bottom, height)
+
+
 @njit(cache=True, error_model="numpy", inline="always")
 def _to_camera(x, y, z, camera, projected, k):  # type: ignore[no-untyped-def]
     """Camera coordinates and, beyond the near plane, pixel of a world point into row k of `projected`."""
@@ -355,12 +387,12 @@ def _to_camera(x, y, z, camera, projected, k):  # type: ignore[no-untyped-def]
     depth = camera[2] * x + camera[5] * y + camera[8] * z
     right = camera[0] * x + camera[3] * y + camera[6] * z
     down = camera[1] * x + camera[4] * y + camera[7] * z
-    projected[k, 0] = right
-    projected[k, 1] = down
-    projected[k, 2] = depth
+    projected[0, k] = right
+    projected[1, k] = down
+    projected[2, k] = depth
     if depth >= camera[18]:
-        projected[k, 3] = camera[12] * right / depth + camera[14] - camera[16]
-        projected[k, 4] = camera[13] * down / depth + camera[15] - camera[17]
+        projected[3, k] = camera[12] * right / depth + camera[14] - camera[16]
+        projected[4, k] = camera[13] * down / depth + camera[15] - camera[17]
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -379,7 +411,7 @@ def _record_brightness(record, normals, dual, vertices, first, up, sun, ambient,
     gx = b1 * dual[0] + b2 * dual[3]
     gy = b1 * dual[1] + b2 * dual[4]
     gz = b1 * dual[2] + b2 * dual[5]
-    b0 -= gx * vertices[first, 0] + gy * vertices[first, 1] + gz * vertices[first, 2]
+    b0 -= gx * vertices[0, first] + gy * vertices[1, first] + gz * vertices[2, first]
     _record_affine(record, 5, gx, gy, gz, b0, R, eye, camera)
 
 
@@ -423,26 +455,26 @@ def _in_view(x, y, z, radius, sides, near):  # type: ignore[no-untyped-def]
 @njit(cache=True, error_model="numpy")
 def _project_face(i, j, k, projected, near, fx, fy, cx, cy, offset_u, offset_v, polygon):  # type: ignore[no-untyped-def]
     """Put the corners (u, v) of face (i, j, k), cut at the near plane, into `polygon`; returns how many: 0, 3 or 4."""
-    in_i, in_j, in_k = projected[i, 2] >= near, projected[j, 2] >= near, projected[k, 2] >= near
+    in_i, in_j, in_k = projected[2, i] >= near, projected[2, j] >= near, projected[2, k] >= near
     if in_i and in_j and in_k:
-        polygon[0, 0], polygon[0, 1] = projected[i, 3], projected[i, 4]
-        polygon[1, 0], polygon[1, 1] = projected[j, 3], projected[j, 4]
-        polygon[2, 0], polygon[2, 1] = projected[k, 3], projected[k, 4]
+        polygon[0, 0], polygon[0, 1] = projected[3, i], projected[4, i]
+        polygon[1, 0], polygon[1, 1] = projected[3, j], projected[4, j]
+        polygon[2, 0], polygon[2, 1] = projected[3, k], projected[4, k]
         return 3
     if not (in_i or in_j or in_k):
         return 0
     n = 0
     for a, b in ((i, j), (j, k), (k, i)):
-        in_a, in_b = projected[a, 2] >= near, projected[b, 2] >= near
+        in_a, in_b = projected[2, a] >= near, projected[2, b] >= near
         if in_a:
-            polygon[n, 0], polygon[n, 1] = projected[a, 3], projected[a, 4]
+            polygon[n, 0], polygon[n, 1] = projected[3, a], projected[4, a]
             n += 1
         if in_a != in_b:
             # From the inner to the outer corner, so that two faces cut their common edge at the very same point.
             p, q = (a, b) if in_a else (b, a)
-            s = (near - projected[p, 2]) / (projected[q, 2] - projected[p, 2])
-            x = projected[p, 0] + s * (projected[q, 0] - projected[p, 0])
-            y = projected[p, 1] + s * (projected[q, 1] - projected[p, 1])
+            s = (near - projected[2, p]) / (projected[2, q] - projected[2, p])
+            x = projected[0, p] + s * (projected[0, q] - projected[0, p])
+            y = projected[1, p] + s * (projected[1, q] - projected[1, p])
             polygon[n, 0] = fx * x / near + cx - offset_u
             polygon[n, 1] = fy * y / near + cy - offset_v
             n += 1
@@ -491,6 +523,9 @@ def _fill(x0, y0, x1, y1, x2, y2, iz_u, iz_v, iz_0, number, inverse_depth, trian
     for row in range(first, last):
         left, right = _columns(row, x0, y0, x1, y1, long_slope, upper, lower, width)
         base = iz_0 + iz_v * row
+        if right - left > LONG_RUN:
+            drawn |= _fill_run(base, iz_u, left, number, inverse_depth[row, left:right], triangle_at[row, left:right])
+            continue
         for column in range(left, right):
             iz = np.float32(base + iz_u * column)
             if iz > inverse_depth[row, column]:
@@ -498,6 +533,20 @@ def _fill(x0, y0, x1, y1, x2, y2, iz_u, iz_v, iz_0, number, inverse_depth, trian
                 triangle_at[row, column] = number
                 drawn = True
     return drawn
+
+
+@njit(cache=True, error_model="numpy")
+def _fill_run(base, iz_u, left, number, inverse_depth, triangle_at):  # type: ignore[no-untyped-def]
+    """A long run of pixels from column `left`, without branches, so that it becomes vector code."""
+    drawn = np.int32(0)
+    number = np.int32(number)
+    for c in range(len(inverse_depth)):
+        iz = np.float32(base + iz_u * (left + c))
+        closer = iz > inverse_depth[c]
+        inverse_depth[c] = iz if closer else inverse_depth[c]
+        triangle_at[c] = number if closer else triangle_at[c]
+        drawn |= np.int32(closer)
+    return drawn > 0
 
 
 @njit(cache=True, error_model="numpy")
@@ -520,17 +569,18 @@ def _fill_contact(  # type: ignore[no-untyped-def]
     x0, y0, x1, y1, long_slope, upper, lower, first, last = _edges(x0, y0, x1, y1, x2, y2, width, height)
     for row in range(first, last):
         left, right = _columns(row, x0, y0, x1, y1, long_slope, upper, lower, width)
-        if left < right:
-            spans[row, 0] = min(spans[row, 0], left)
-            spans[row, 1] = max(spans[row, 1], right)
-        for column in range(left, right):
-            iz = maps[2, 0] * column + maps[2, 1] * row + maps[2, 2]
-            if iz <= 0.0:
-                continue
-            x = (maps[0, 0] * column + maps[0, 1] * row + maps[0, 2]) / iz + eye_x
-            y = (maps[1, 0] * column + maps[1, 1] * row + maps[1, 2]) / iz + eye_y
+        if left >= right:
+            continue
+        spans[row, 0] = min(spans[row, 0], left)
+        spans[row, 1] = max(spans[row, 1], right)
+        feet = contact[row, left:right]
+        x_0, y_0, iz_0 = maps[0, 1] * row, maps[1, 1] * row, maps[2, 1] * row
+        for c in range(len(feet)):
+            column = left + c
+            iz = maps[2, 0] * column + iz_0 + maps[2, 2]
+            x = (maps[0, 0] * column + x_0 + maps[0, 2]) / iz + eye_x
+            y = (maps[1, 0] * column + y_0 + maps[1, 2]) / iz + eye_y
             away = sqrt(max(abs(x) - half_x, 0.0) ** 2 + max(abs(y) - half_y, 0.0) ** 2)
             dark = max(0.0, 1.0 - away / margin)
             value = np.uint8(255.0 * strength * dark * dark)
-            if value > contact[row, column]:
-                contact[row, column] = value
+            feet[c] = value if iz > 0.0 and value > feet[c] else feet[c]

@@ -147,7 +147,7 @@ class Rasterizer:
         self._shadow_spans = self._spans.copy()
         self._shaded = own.shadows or own.contact > 0
         self._look = np.array([own.contact, own.shadows, own.clouds, own.smooth])
-        self._projected = np.empty((max(4, *(len(m.vertices) for m in meshes), 4), 5))
+        self._projected = np.empty((5, max(4, *(len(m.vertices) for m in meshes), 4)))
         self._triangles = np.empty((1024, TRIANGLE_FIELDS), np.float32)
         self._noise = _noise_tile().ravel()
         self._light = Light()
@@ -273,6 +273,8 @@ class Rasterizer:
             lights,
             self._look,
             self._noise,
+            self._inverse_depth,
+            self._spans,
             self._shadow,
             self._contact,
             self._shadow_spans,
@@ -395,8 +397,8 @@ def _contiguous(array: ArrayLike, dtype: type) -> NDArray[Any]:
 def _pack(meshes: Sequence[Mesh], look: Look) -> tuple[NDArray[Any], ...]:
     """All meshes end to end, as the kernels take them.
 
-    First vertex and face of each mesh, bounding spheres, boxes; vertices; faces, their planes, colours, kinds, corner
-    normals (9), gradients of their second and third corner's weight (6), directions of their pattern (6).
+    First vertex and face of each mesh, bounding spheres, boxes; vertices (3, v); faces, their planes, colours, kinds,
+    corner normals (9), gradients of their second and third corner's weight (6), directions of their pattern (6).
     """
     for i, m in enumerate(meshes):
         if not np.isfinite(m.vertices).all() or len(m.colors) != len(m.faces):
@@ -409,7 +411,7 @@ def _pack(meshes: Sequence[Mesh], look: Look) -> tuple[NDArray[Any], ...]:
         np.cumsum([0, *(len(m.faces) for m in meshes)]).astype(np.int64),
         np.array([_bounding_sphere(m.vertices) for m in meshes]).reshape(-1, 4),
         np.array([np.concatenate(extent(m)) for m in meshes]).reshape(-1, 6),
-        np.vstack([np.zeros((0, 3)), *(m.vertices for m in meshes)]),
+        np.ascontiguousarray(np.vstack([np.zeros((0, 3)), *(m.vertices for m in meshes)]).T),
         np.vstack([np.zeros((0, 3), np.int32), *(m.faces for m in meshes)]).astype(np.int32),
         *(np.vstack([np.zeros((0, k)), *(s[i] for s in surfaces)]) for i, k in enumerate((4, 3))),
         np.concatenate([np.zeros(0, np.uint8), *(s[2] for s in surfaces)]),
