@@ -11,9 +11,10 @@ import math
 
 import numpy as np
 
+from .bayes_overlap import CONCENTRATION, WEIGHTS, overlap_features
 from .bayes_prepare import LOG_2PI, Problem, Settings, levelling_rotation, prepare, ranges
 from .bayes_solve import Modes, Prior, decode, mix, solve_levelled, solve_spatial
-from .bayes_view import View, sector_evidence
+from .bayes_view import View
 from .graph import DEFAULT_BEARING_STD_RAD, Hypothesis, Matching, ObjectGraph, check_comparable
 from .pose import Array, RelativePose
 
@@ -27,8 +28,8 @@ LEAST_HYPOTHESIS = 0.01
 ALTERNATIVES: tuple[tuple[float, float], ...] = ((0.2, 0.0), (4.0, 0.0), (1.0, 0.07))
 """Factor on all variances, and prior deviation of the robots' depth scales, tried where the reported ones fit badly."""
 
-OTHER_SCALE_PROBABILITY = 0.05
-DOUBTFUL = 2.0
+OTHER_SCALE_PROBABILITY = 0.02
+DOUBTFUL = 1.0
 """Log evidence below which wrong variances and scales are considered."""
 
 
@@ -113,18 +114,27 @@ def bayes(
         solve = solve_levelled if gravity else solve_spatial
         pose_prior = _pose_prior(prior, problem, L_a, L_b, gravity)
         found = solve(problem, pose_prior, view_a, view_b, q, screened, refined)
-        if prior is not None or not gravity or view_a.known > 0:
+        if prior is not None:
             return found
-        alone = sector_evidence(problem.p_a, problem.p_b, found.R, found.t, found.marginals)
-        return found._replace(log_evidence=found.log_evidence + alone)
+        if not gravity or view_a.known > 0:
+            return found._replace(log_evidence=found.log_evidence + POSE_CONCENTRATION)
+        features = overlap_features(
+            problem.p_a,
+            problem.p_b,
+            problem.likely,
+            problem.median_range,
+            found.R,
+            found.t,
+            found.marginals,
+            found.log_evidence,
+        )
+        return found._replace(log_evidence=features @ WEIGHTS + CONCENTRATION)
 
     modes = explain(1.0, scale_std)
     if rescale and modes.log_evidence.max(initial=-math.inf) < DOUBTFUL:
         modes = _joined([modes, *(explain(*x) for x in ALTERNATIVES)])
     if prior is None:
-        weights, P = mix(
-            modes, math.log(common_probability) + POSE_CONCENTRATION, math.log1p(-common_probability), n, m
-        )
+        weights, P = mix(modes, math.log(common_probability), math.log1p(-common_probability), n, m)
     else:
         weights, P = mix(modes, 0.0, -1e9, n, m)
     pairs, scores = decode(P, min_score)

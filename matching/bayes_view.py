@@ -12,13 +12,6 @@ from .pose import Array
 EDGE_RAD = 0.02
 RANGE_SOFTNESS = 0.2
 LEAST_PROBABILITY = 0.01
-SECTOR_MARGIN_RAD = 0.05
-SECTOR_REACH = 1.05
-SECTOR_COST = 0.2
-"""Nats against a pose for an object that stays alone although the other robot evidently looks there (fitted)."""
-
-SECTOR_SHARE = 0.6
-"""Share of the objects that stay alone which lie there anyway; it takes the mean off (fitted)."""
 
 
 class View(NamedTuple):
@@ -63,52 +56,3 @@ def detection_probability(x: float, y: float, z: float, view: View, detections: 
     if gap < view.occluder * view.occluder:
         p *= view.occluded
     return max(p, LEAST_PROBABILITY)
-
-
-@njit(cache=True)
-def seen_sector(p: Array) -> tuple[float, float, float]:
-    """Where a robot evidently looks: middle and half width (rad) and reach (m) of its detections.
-
-    Positions (n + 1, 3) m, levelled, the robot itself last.
-    """
-    n = len(p) - 1
-    x = y = reach = 0.0
-    for i in range(n):
-        r = np.sqrt(p[i, 0] ** 2 + p[i, 1] ** 2) + 1e-12
-        x += p[i, 0] / r
-        y += p[i, 1] / r
-        reach = max(reach, r)
-    middle = np.arctan2(y, x)
-    half = 0.0
-    for i in range(n):
-        half = max(half, abs((np.arctan2(p[i, 1], p[i, 0]) - middle + np.pi) % (2 * np.pi) - np.pi))
-    return middle, half + SECTOR_MARGIN_RAD, SECTOR_REACH * reach
-
-
-@njit(cache=True)
-def alone_in_sector(x: float, y: float, alone: float, sector: tuple[float, float, float]) -> float:
-    """Nats for an object at (x, y) m in the other robot's frame that has no match with probability `alone`."""
-    middle, half, reach = sector
-    inside = x * x + y * y < reach * reach and abs((np.arctan2(y, x) - middle + np.pi) % (2 * np.pi) - np.pi) < half
-    return SECTOR_COST * alone * (SECTOR_SHARE - 1.0 if inside else SECTOR_SHARE)
-
-
-@njit(cache=True)
-def sector_evidence(p_a: Array, p_b: Array, R: Array, t: Array, marginals: Array) -> Array:
-    """What objects that stay alone say of every mode (k,), in nats, where fields of view are not known.
-
-    Positions (n + 1, 3), (m + 1, 3) m, levelled, the robots themselves last; poses (k, 3, 3), (k, 3) of target to
-    source; match probabilities (k, n, m).
-    """
-    n, m = len(p_a) - 1, len(p_b) - 1
-    sector_a, sector_b = seen_sector(p_a), seen_sector(p_b)
-    out = np.zeros(len(R))
-    for k in range(len(R)):
-        c, s = R[k, 0, 0], R[k, 1, 0]
-        for i in range(n):
-            x, y = p_a[i, 0] - t[k, 0], p_a[i, 1] - t[k, 1]
-            out[k] += alone_in_sector(c * x + s * y, c * y - s * x, 1.0 - marginals[k, i].sum(), sector_b)
-        for j in range(m):
-            x, y = c * p_b[j, 0] - s * p_b[j, 1] + t[k, 0], s * p_b[j, 0] + c * p_b[j, 1] + t[k, 1]
-            out[k] += alone_in_sector(x, y, 1.0 - marginals[k, :, j].sum(), sector_a)
-    return out

@@ -9,14 +9,8 @@ import pytest
 
 from covis.matching import ObjectGraph, RelativePose, bayes
 from covis.matching.bayes_assignment import assignment_marginals
+from covis.matching.bayes_overlap import MARGIN_RAD, REACH, overlap_features
 from covis.matching.bayes_prepare import class_evidence, height_correction, levelling_rotation
-from covis.matching.bayes_view import (
-    SECTOR_COST,
-    SECTOR_MARGIN_RAD,
-    SECTOR_REACH,
-    SECTOR_SHARE,
-    sector_evidence,
-)
 from covis.matching.metrics import count, expected_calibration_error, is_correct, pooled
 from covis.matching.pose import invert
 
@@ -334,29 +328,54 @@ def test_wrong_variances_and_a_wrong_depth_scale_are_noticed(factor, scale):
     assert pooled(rescaled).f1 > 0.7
 
 
-def test_alone_in_the_sector_of_the_other_robot_speaks_against_a_pose():
+def test_overlap_features_against_plain_geometry():
     rng = np.random.default_rng(5)
-    n, m = 6, 5
+    n, m, median_range = 6, 5, 7.0
     p_a, p_b = rng.uniform(-10, 10, (n + 1, 3)), rng.uniform(1, 10, (m + 1, 3))
     p_a[-1] = p_b[-1] = 0.0
-    yaw = np.array([0.3, -2.0, 1.2])
-    R = np.array([[[np.cos(w), -np.sin(w), 0], [np.sin(w), np.cos(w), 0], [0, 0, 1]] for w in yaw])
+    R = np.array([rotation_z(w) for w in (0.3, -2.0, 1.2)])
     t = rng.uniform(-8, 8, (3, 3))
     marginals = rng.uniform(0, 1 / n, (3, n, m))
+    likely = rng.standard_normal((n + 1, m + 1))
+    evidence = rng.standard_normal(3)
 
-    def inside(x, p):
+    def sector(p):
         ray = p[:-1, 0] + 1j * p[:-1, 1]
         middle = (ray / abs(ray)).sum()
-        half = abs(np.angle(ray / middle)).max() + SECTOR_MARGIN_RAD
-        z = x[:, 0] + 1j * x[:, 1]
-        return (abs(np.angle(z / middle)) < half) & (abs(z) < SECTOR_REACH * abs(ray).max())
+        return np.angle(middle), min(abs(np.angle(ray / middle)).max() + MARGIN_RAD, np.pi), REACH * abs(ray).max()
 
-    expected = []
+    def inside(x, p):
+        middle, half, reach = sector(p)
+        z = x[:, 0] + 1j * x[:, 1]
+        return (abs(np.angle(z * np.exp(-1j * middle))) < half) & (abs(z) < reach)
+
+    def places(p):
+        middle, half, reach = sector(p)
+        z = reach * np.sqrt(rng.random(40000)) * np.exp(1j * (middle + half * rng.uniform(-1, 1, 40000)))
+        return np.c_[z.real, z.imag, 0 * z.real]
+
+    found = overlap_features(p_a, p_b, likely, median_range, R, t, marginals, evidence)
     for k in range(3):
         in_b, in_a = inside((p_a[:-1] - t[k]) @ R[k], p_b), inside(p_b[:-1] @ R[k].T + t[k], p_a)
-        alone_a, alone_b = 1 - marginals[k].sum(axis=1), 1 - marginals[k].sum(axis=0)
-        expected.append(
-            SECTOR_COST * (((SECTOR_SHARE - in_b) * alone_a).sum() + ((SECTOR_SHARE - in_a) * alone_b).sum())
+        M = marginals[k]
+        alone = ((1 - M.sum(axis=1)) * in_b).sum() + ((1 - M.sum(axis=0)) * in_a).sum()
+        share_a, share_b = (
+            inside((places(p_a) - t[k]) @ R[k], p_b).mean(),
+            inside(places(p_b) @ R[k].T + t[k], p_a).mean(),
         )
-    assert np.ptp(expected) > 0.1
-    np.testing.assert_allclose(sector_evidence(p_a, p_b, R, t, marginals), expected, atol=1e-12)
+        distance = np.hypot(*t[k, :2]) / median_range
+        np.testing.assert_allclose(
+            found[k, [0, 1, 2, 7]], [evidence[k], (M * likely[:-1, :-1]).sum(), alone, distance], atol=1e-9
+        )
+        np.testing.assert_allclose(found[k, 3], n * share_a + m * share_b, atol=0.4)
+        np.testing.assert_allclose(found[k, 5], np.log(0.5 * (share_a + share_b)), atol=0.15)
+        np.testing.assert_allclose(found[k, 4], -0.5 * M.sum() * np.log(share_a * share_b), rtol=0.15)
+
+
+def test_sectors_tell_a_pose_whose_overlap_is_empty_of_common_objects():
+    """Half of what A sees stands where B does not look: evidence for the pose under which B should not see it."""
+    p_a = np.array([[5.0, -2, 0], [6, 1, 0], [8, 2, 0], [7, -3, 0], [0, 0, 0]])
+    away, towards = rotation_z(np.pi), np.eye(3)
+    R, t = np.array([away, towards]), np.zeros((2, 3))
+    alone = overlap_features(p_a, p_a, np.zeros((5, 5)), 6.0, R, t, np.zeros((2, 4, 4)), np.zeros(2))[:, 2]
+    np.testing.assert_array_equal(alone, [0.0, 8.0])
