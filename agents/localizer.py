@@ -105,7 +105,7 @@ def claims(views: Sequence[View], matchings: Matchings, max_detections: int, gai
     for i, view in enumerate(views):
         n = len(view.detections)
         claim = Claims.empty(max_detections, len(views) - 1)
-        own = fuse_own(graphs, poses, groups, i, gain=gain)
+        own = fuse_own(graphs, poses, groups, i, gain=gain, frame_covariance=view.pose_covariance)
         claim.boxes[:n] = view.detections.boxes
         claim.positions[:n] = own.positions
         claim.positions_single[:n] = own.positions_single

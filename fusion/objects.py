@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from ..matching.graph import Matching, ObjectGraph
-from ..matching.pose import Array, RelativePose
+from ..matching.pose import Array, RelativePose, skews
 
 Gain = Literal["covariance", "joint", "paper"]
 GAINS: tuple[Gain, ...] = ("covariance", "joint", "paper")
@@ -142,6 +143,7 @@ def fuse(
     frame: int = 0,
     gain: Gain = "covariance",
     gate: float | None = None,
+    frame_covariance: Array | None = None,
 ) -> FusedObjects:
     """Fused objects of N robots in the sensor frame of robot `frame`.
 
@@ -153,6 +155,8 @@ def fuse(
         gain: "covariance", "joint" or "paper".
         gate: share of honest measurements to keep, for example 0.999; what disagrees more with the rest of its group is
             left out (`used`), so that a robot that is wrong does not drag the estimate. None = keep all.
+        frame_covariance: covariance (6, 6) of the frame robot's own pose in the world, where all the relative poses
+            rest on it: the partners then share its error, and `gain="covariance"` counts it once. None = independent.
 
     Returns:
         Every group with a position in the frame; groups seen only by robots of unknown pose are left out.
@@ -176,7 +180,10 @@ def fuse(
     if np.isfinite(threshold):
         _gate(rows, positions, covariances, threshold)
         used = rows >= 0
-    fused, fused_covariances = _fuse_groups(rows, positions, covariances)
+    if frame_covariance is None or gain != "covariance":
+        fused, fused_covariances = _fuse_groups(rows, positions, covariances)
+    else:
+        fused, fused_covariances = _fuse_sharing(rows, positions, covariances, frame, frame_covariance)
     return FusedObjects(frame, fused, fused_covariances, members, used, groups.scores[keep])
 
 
@@ -188,9 +195,11 @@ def fuse_own(
     *,
     gain: Gain = "covariance",
     gate: float | None = None,
+    frame_covariance: Array | None = None,
 ) -> OwnObjects:
     """Every detection of `robot`, fused with what its partners measured; arguments as in `fuse`."""
-    return own_objects(graphs, fuse(graphs, poses, matchings, frame=robot, gain=gain, gate=gate), gain=gain)
+    fused = fuse(graphs, poses, matchings, frame=robot, gain=gain, gate=gate, frame_covariance=frame_covariance)
+    return own_objects(graphs, fused, gain=gain)
 
 
 def agreement(fused: FusedObjects) -> Array:
@@ -236,6 +245,7 @@ def _check(graphs: Sequence[ObjectGraph], frame: int, gain: str) -> None:
         raise ValueError(f"gain must be one of {', '.join(GAINS)}, got {gain!r}")
 
 
+@lru_cache(maxsize=16)
 def _threshold(gate: float | None) -> float:
     """Squared Mahalanobis distance that a share `gate` of honest differences in three dimensions stays below."""
     if gate is None:
@@ -279,6 +289,28 @@ def _move(pose: RelativePose, positions: Array, covariances: Array, gain: Gain) 
     if gain == "paper":
         return moved, covariances
     return moved, R @ covariances @ R.T + pose.position_covariances(positions)
+
+
+def _fuse_sharing(
+    rows: NDArray[np.int64], positions: Array, covariances: Array, frame: int, frame_covariance: Array
+) -> tuple[Array, Array]:
+    """As `_fuse_groups`, where all but the frame robot's measurements share the error of that robot's own pose.
+
+    Without that error they are independent: they are fused without it, it is added to the result, and that is fused
+    with the frame robot's own measurement.
+    """
+    m, n = len(rows), len(positions)
+    J = np.concatenate([np.broadcast_to(np.eye(3), (n, 3, 3)), -skews(positions)], axis=2)
+    shared = J @ frame_covariance @ J.transpose(0, 2, 1)
+    partners = rows.copy()
+    partners[:, frame] = -1
+    some = (partners >= 0).any(axis=1)
+    theirs, theirs_covariances = _fuse_groups(partners[some], positions, covariances - shared)
+    theirs_covariances = theirs_covariances + shared[partners[some].max(axis=1)]
+    both = np.full((m, 2), -1, dtype=np.int64)
+    both[:, 0] = rows[:, frame]
+    both[some, 1] = n + np.arange(int(some.sum()))
+    return _fuse_groups(both, np.concatenate([positions, theirs]), np.concatenate([covariances, theirs_covariances]))
 
 
 def _edges(

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..matching.graph import Matching, ObjectGraph
-from ..matching.pose import Array, RelativePose, exp_se3, invert, rotation_from_vector
+from ..matching.pose import Array, RelativePose, exp_se3, invert, rotation_from_vector, skews
 
 VARIANCE_FLOOR = 1e-12
 """m^2 added to every residual's covariance, so that exact measurements can be registered."""
@@ -172,7 +172,7 @@ def _normal_equations(
     fused_q = q + np.einsum("nij,nj->ni", C_q @ R.T @ W, residuals)
     J = np.zeros((len(p), 3, 6))  # d(T q) / d(right perturbation)
     J[:, :, :3] = R
-    J[:, :, 3:] = -R @ _skews(fused_q)
+    J[:, :, 3:] = -R @ skews(fused_q)
     JtW = J.transpose(0, 2, 1) @ (W * weights[:, None, None])
     H = (JtW @ J).sum(axis=0)
     g = np.einsum("nij,nj->i", JtW, residuals)
@@ -266,11 +266,4 @@ def _orthonormal(T: Array) -> Array:
     U, _, Vt = np.linalg.svd(T[:3, :3])
     out = T.copy()
     out[:3, :3] = U @ Vt
-    return out
-
-
-def _skews(v: Array) -> Array:
-    out = np.zeros((len(v), 3, 3))
-    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
-    out[:, 1, 0], out[:, 2, 0], out[:, 2, 1] = v[:, 2], -v[:, 1], v[:, 0]
     return out

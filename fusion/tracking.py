@@ -160,11 +160,49 @@ class Tracker:
             state = replace(later[0].before, next_id=self.tracks.next_id)
             del self._history[-len(later) :]
         labels, state = self._advance(state, batch, None)
+        self._replay(state, later)
+        return labels
+
+    def revise(self, batch: Batch, same: int) -> NDArray[np.int64]:
+        """Put a batch in the place of the one taken in for the same time: more is known of that time now.
+
+        Args:
+            same: so many measurements, the first, are those of the old batch, known better; others may follow.
+
+        Returns:
+            As `update`.
+
+        Raises:
+            ValueError: as `update`; or `same` is more than either batch has.
+            KeyError: no batch of that time is in the history.
+        """
+        _check(batch)
+        index = next((k for k, past in enumerate(self._history) if past.batch.time == batch.time), None)
+        if index is None:
+            raise KeyError(f"no batch of time {batch.time} is in the history")
+        past, *later = self._history[index:]
+        if not 0 <= same <= min(len(past.labels), len(batch.positions)):
+            raise ValueError(f"same must lie in 0..{min(len(past.labels), len(batch.positions))}, got {same}")
+        remembered = np.full(len(batch.positions), -1, dtype=np.int64)
+        remembered[:same] = past.labels[:same]
+        state = replace(past.before, next_id=self.tracks.next_id)
+        del self._history[index:]
+        labels, state = self._advance(state, batch, remembered)
+        self._replay(state, later)
+        return labels
+
+    def labels(self, time: float) -> NDArray[np.int64]:
+        """Track id (n,) of each measurement of the batch of that time. Raises KeyError where the history has none."""
+        for past in reversed(self._history):
+            if past.batch.time == time:
+                return past.labels
+        raise KeyError(f"no batch of time {time} is in the history")
+
+    def _replay(self, state: Tracks, later: list[_Past]) -> None:
         for past in later:
             _, state = self._advance(state, past.batch, past.labels)
         self.tracks = state
         self._forget()
-        return labels
 
     def confirmed(self) -> Tracks:
         """Tracks with enough measurements."""

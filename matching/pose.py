@@ -130,11 +130,12 @@ class RelativePose:
         R = self.T_source_target[:3, :3]
         J = np.zeros((len(positions), 3, 6))
         J[:, :, :3] = R
-        J[:, :, 3:] = -R @ _skews(positions)
+        J[:, :, 3:] = -R @ skews(positions)
         return J @ self.covariance @ J.transpose(0, 2, 1)
 
 
-def _skews(v: Array) -> Array:
+def skews(v: Array) -> Array:
+    """`skew` of each of v (n, 3): (n, 3, 3)."""
     out = np.zeros((len(v), 3, 3))
     out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
     out[:, 1, 0], out[:, 2, 0], out[:, 2, 1] = v[:, 2], -v[:, 1], v[:, 0]
