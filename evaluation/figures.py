@@ -92,6 +92,30 @@ def scaling_figure(rows: Sequence[Row]) -> Figure:
     return figure
 
 
+def team_figure(rows: Sequence[Row]) -> Figure:
+    """Error of a robot on all it sees against the size of its team; rows of `covis localize team`."""
+    sizes = sorted((row for row in rows if row.get("what") == "size"), key=lambda row: row["robots"])
+    robots = [row["robots"] for row in sizes]
+    figure, (error, nees) = _figure(2, 4.4, 3.4)
+    for key, label, color in (
+        ("fused_m", "mean", OURS),
+        ("fused_median_m", "median", OTHERS[1]),
+        ("fused_p95_m", "95 %", OTHERS[0]),
+    ):
+        error.plot(robots, [row[key] for row in sizes], marker="o", markersize=4, color=color, label=label)
+    error.set_ylim(bottom=0)
+    error.set_ylabel("displacement error, m")
+    error.legend(fontsize=8, frameon=False)
+    nees.axhspan(0.8, 1.2, color="0.9", zorder=0)
+    nees.plot(robots, [row["nees_per_dof"] for row in sizes], marker="o", markersize=4, color=OURS)
+    nees.set_ylim(0.5, 1.5)
+    nees.set_ylabel("NEES per degree of freedom")
+    for axis in (error, nees):
+        axis.set_xlabel("robots")
+        axis.set_xticks(robots)
+    return figure
+
+
 def reliability_figure(curves: dict[str, Sequence[Any]]) -> Figure:
     """Share of right matches against their score, a line per method; `curves` maps a name to its ReliabilityBins."""
     figure, (axis,) = _figure(1, 4.2, 4.0)

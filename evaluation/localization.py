@@ -223,29 +223,33 @@ def _tracks(sights: Sequence[Sight]) -> list[list[dict[int, int]]]:
 
 
 def fault_rows(settings: Settings, min_score: float) -> list[Row]:
-    """Each fault with and without protections: the good robots' error, and F1 of the matches among them."""
-    settings = replace(settings, episodes=settings.episodes or TEAM_EPISODES)
-    steps = list(instants(TEAM_SCENE, settings, CONSISTENT_ROBOTS))
-    motion = MOTIONS[TEAM_SCENE]
-    guarded = MemberOptions(tracker=motion.tracker, repeated=motion.repeated)
-    open_ = replace(UNPROTECTED, tracker=motion.tracker, repeated=motion.repeated)
+    settings = replace(settings, episodes=settings.episodes or TEAM_EPISODES, n_robots=CONSISTENT_ROBOTS)
+    steps = list(instants(TEAM_SCENE, settings))
     matchers: dict[str, Callable[[int], Match]] = {
         "bayes": lambda _: BayesMatches(min_score),
         "true": lambda episode: TrueMatches.of(steps, episode),
     }
+    head = {"part": "faults", "target": TEAM_SCENE, "episodes": settings.episodes, "min_score": min_score}
+    return [
+        head | {"matches": name} | row
+        for name, matcher in matchers.items()
+        for row in faults_of(steps, matcher, settings.seed)
+    ]
+
+
+def faults_of(steps: Sequence[Instant], matcher: Callable[[int], Match], seed: int = 0) -> list[Row]:
+    """Each fault with and without protections: the good robots' error, and F1 of the matches among them."""
+    motion = MOTIONS[TEAM_SCENE]
+    guarded = MemberOptions(tracker=motion.tracker, repeated=motion.repeated)
+    open_ = replace(UNPROTECTED, tracker=motion.tracker, repeated=motion.repeated)
     rows: list[Row] = []
-    for matches, matcher in matchers.items():
-        for name, options in (("with", guarded), ("without", open_)):
-            sound = None
-            for fault in FAULTS:
-                row = _fault_row(steps, options, matcher, fault, settings.seed)
-                sound = sound or row["fused_m"]
-                rows.append(
-                    {"part": "faults", "target": TEAM_SCENE, "robots": CONSISTENT_ROBOTS, "fault": fault.name}
-                    | {"matches": matches, "protections": name, "episodes": settings.episodes, "min_score": min_score}
-                    | row
-                    | {"growth": row["fused_m"] / sound - 1.0}
-                )
+    for name, options in (("with", guarded), ("without", open_)):
+        sound = None
+        for fault in FAULTS:
+            row = _fault_row(steps, options, matcher, fault, seed)
+            sound = sound or row["fused_m"]
+            head = {"robots": len(steps[0].views), "fault": fault.name, "protections": name}
+            rows.append(head | row | {"growth": row["fused_m"] / sound - 1.0})
     return rows
 
 
@@ -289,14 +293,18 @@ def _among_good(sight: Sight, bad: int) -> Sight:
 
 
 def team_rows(settings: Settings) -> list[Row]:
-    """Robot 0's error on all it sees as partners are added; matches made consistent against pairwise ones."""
-    settings = replace(settings, episodes=settings.episodes or TEAM_EPISODES)
-    steps = list(instants(TEAM_SCENE, settings, MAX_ROBOTS))
-    matched = [_all_pairs(step) for step in steps]
-    rows = [_size_row(steps, matched, n) for n in range(1, MAX_ROBOTS + 1)]
-    rows += [_consistency_row(steps, matched, n) for n in (CONSISTENT_ROBOTS, MAX_ROBOTS)]
+    settings = replace(settings, episodes=settings.episodes or TEAM_EPISODES, n_robots=MAX_ROBOTS)
+    steps = list(instants(TEAM_SCENE, settings))
     head = {"part": "team", "target": TEAM_SCENE, "episodes": settings.episodes, "frames": len(steps)}
-    return [head | row for row in rows]
+    return [head | row for row in sizes_of(steps)]
+
+
+def sizes_of(steps: Sequence[Instant]) -> list[Row]:
+    """Error of a robot on all it sees as partners are added; matches made consistent against pairwise ones."""
+    matched = [_all_pairs(step) for step in steps]
+    n_robots = len(steps[0].views)
+    rows = [_size_row(steps, matched, n) for n in range(1, n_robots + 1)]
+    return rows + [_consistency_row(steps, matched, n) for n in (CONSISTENT_ROBOTS, n_robots)]
 
 
 def _relative(step: Instant, i: int, j: int) -> RelativePose:
@@ -319,8 +327,9 @@ def _size_row(steps: Sequence[Instant], matched: Sequence[dict[tuple[int, int], 
     """Every robot in turn with the n - 1 that follow it."""
     errors = []
     for step, matchings in zip(steps, matched, strict=True):
-        for first in range(MAX_ROBOTS):
-            team = sorted((first + k) % MAX_ROBOTS for k in range(n))
+        robots = len(step.views)
+        for first in range(robots):
+            team = sorted((first + k) % robots for k in range(n))
             errors.append(_team_errors(step, matchings, team, first))
     return {"what": "size", "robots": n} | _figures("", np.concatenate(errors))
 
@@ -343,8 +352,9 @@ def _consistency_row(steps: Sequence[Instant], matched: Sequence[dict[tuple[int,
     """Every robot in turn with the n - 1 that follow it: pairwise matches as they are, and made consistent."""
     before, after, consistent_frames = [], [], []
     for step, matchings in zip(steps, matched, strict=True):
-        for first in range(MAX_ROBOTS if n < MAX_ROBOTS else 1):
-            team = sorted((first + k) % MAX_ROBOTS for k in range(n))
+        robots = len(step.views)
+        for first in range(robots if n < robots else 1):
+            team = sorted((first + k) % robots for k in range(n))
             sizes = [len(step.views[r].detections) for r in team]
             possible = _within(matchings, team)
             joined = consistent(possible, sizes)

@@ -44,9 +44,9 @@ class Instant:
     visible: list[Array]
 
 
-def instants(scene: str, settings: Settings, n_robots: int | None = None) -> Iterator[Instant]:
+def instants(scene: str, settings: Settings) -> Iterator[Instant]:
     """All steps of a scene's episodes, driven by its scripted controllers."""
-    env = make_env(scene, settings, n_robots=n_robots)
+    env = make_env(scene, settings)
     perceive = make_perceptor(settings.perception, env)
     try:
         for episode in range(settings.episodes or 1):

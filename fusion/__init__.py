@@ -5,6 +5,7 @@ from covis.fusion import fuse, fuse_own, register
 
 from .channel import Channel, ChannelOptions
 from .gaussian import Gaussian, covariance_intersection, fuse_gaussians, fuse_isotropic, fused_variance, fusion_gains
+from .member import UNPROTECTED, Localized, Member, MemberOptions, Report
 from .objects import (
     FusedObjects,
     Groups,
@@ -22,17 +23,22 @@ from .sequence import PairOptions, PairTracker
 from .tracking import Batch, Tracker, TrackerOptions
 
 __all__ = [
+    "UNPROTECTED",
     "Batch",
     "Channel",
     "ChannelOptions",
     "FusedObjects",
     "Gaussian",
     "Groups",
+    "Localized",
+    "Member",
+    "MemberOptions",
     "OwnObjects",
     "PairOptions",
     "PairTracker",
     "Refined",
     "RegistrationError",
+    "Report",
     "Tracker",
     "TrackerOptions",
     "agreement",

@@ -8,6 +8,7 @@ from .benchmark import benchmark
 from .demo import demo
 from .export_data import app as export_data
 from .import_data import app as import_data
+from .localize import localize
 from .record import check, record
 from .report import report
 from .sensitivity import sensitivity
@@ -28,6 +29,7 @@ app.command()(record)
 app.command()(check)
 app.command()(report)
 app.command()(view)
+app.command()(localize)
 app.command()(speed)
 app.command()(sensitivity)
 app.add_typer(import_data, name="import")

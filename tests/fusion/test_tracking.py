@@ -165,3 +165,30 @@ def test_bad_batches_and_options_raise():
     labels, tracks = step(Tracks.none(), Batch(0.0, np.zeros((0, 3)), np.zeros((0, 3, 3))), TrackerOptions())
     assert len(labels) == len(tracks) == 0
     assert len(predict(tracks, 1.0, 1.0)) == 0
+
+
+def test_a_revised_batch_is_as_if_it_had_come_at_once():
+    rng = np.random.default_rng(11)
+    batches, _, _ = moving_objects(rng, steps=8, detection=1.0)
+    better = [Batch(b.time, b.positions + 0.01, 0.5 * b.covariances) for b in batches]
+    revised, direct = Tracker(options()), Tracker(options())
+    for k, batch in enumerate(batches):
+        revised.update(batch)
+        if k >= 2:
+            revised.revise(better[k - 2], len(batch.positions))
+    for batch in [*better[:-2], *batches[-2:]]:
+        direct.update(batch)
+    np.testing.assert_allclose(revised.tracks.states, direct.tracks.states, atol=1e-9)
+    np.testing.assert_array_equal(np.sort(revised.labels(batches[-1].time)), np.sort(revised.tracks.ids))
+
+
+def test_what_a_revision_refuses():
+    tracker = Tracker(options())
+    batch = Batch(1.0, np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)))
+    tracker.update(batch)
+    with pytest.raises(ValueError, match=r"same must lie in 0\.\.2, got 3"):
+        tracker.revise(batch, 3)
+    with pytest.raises(KeyError, match=r"no batch of time 2"):
+        tracker.revise(Batch(2.0, batch.positions, batch.covariances), 2)
+    with pytest.raises(KeyError, match=r"no batch of time 3"):
+        tracker.labels(3.0)

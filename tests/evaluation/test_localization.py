@@ -1,0 +1,53 @@
+"""`covis localize` on a few steps: the rows, and that what they say hangs together."""
+
+from dataclasses import replace
+from itertools import islice
+
+import pytest
+
+pytest.importorskip("pybullet")
+
+from covis.evaluation.localization import MIN_SCORE, accuracy, estimators, faults_of, localization_rows, sizes_of
+from covis.evaluation.localization_team import FAULTS, BayesMatches, TrueMatches, instants, play
+from covis.evaluation.settings import Settings
+
+SETTINGS = Settings(pose="known", seed=3, episodes=1)
+
+
+def first_steps(n_steps, n_robots):
+    return list(islice(instants("multi_robot", replace(SETTINGS, n_robots=n_robots)), n_steps))
+
+
+def test_estimators_are_compared_on_the_same_detections():
+    steps = first_steps(8, 2)
+    rows = {
+        name: accuracy(list(play(steps, options, lambda _: BayesMatches(MIN_SCORE))))
+        for name, options in estimators("multi_robot").items()
+    }
+    assert rows["paper"]["n"] == rows["covariance"]["n"] > 0
+    assert rows["paper"]["single_m"] == rows["covariance"]["single_m"]
+    assert rows["covariance"]["alone_ratio"] == pytest.approx(1.0)
+    assert rows["covariance, tracked"]["ratio"] < rows["covariance"]["ratio"] < 1.0
+    assert "identity_switches" in rows["covariance, tracked"]
+
+
+def test_protections_keep_a_wrong_robot_out():
+    steps = first_steps(8, 4)
+    rows = faults_of(steps, lambda episode: TrueMatches.of(steps, episode))
+    growth = {(row["protections"], row["fault"]): row["growth"] for row in rows}
+    for fault in FAULTS[3:]:
+        assert growth["with", fault.name] < 0.25 < growth["without", fault.name]
+
+
+def test_more_robots_localise_better():
+    rows = sizes_of(first_steps(3, 6))
+    sizes = [row for row in rows if row["what"] == "size"]
+    assert [row["robots"] for row in sizes] == list(range(1, 7))
+    assert sizes[0]["fused_m"] == pytest.approx(sizes[0]["single_m"])
+    assert sizes[5]["fused_m"] < sizes[2]["fused_m"] < sizes[0]["fused_m"]
+    assert all(row["consistent_frames"] == 1.0 for row in rows if row["what"] == "consistency")
+
+
+def test_an_unknown_part_is_named():
+    with pytest.raises(ValueError, match="unknown part 'all'; there are scenes, faults, team"):
+        localization_rows(["all"])
