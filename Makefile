@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-rllib check setup clean
+.PHONY: demo test test-rllib check docs setup clean
 
 setup: $(STAMP)
 
@@ -31,6 +31,12 @@ check: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# The book as a site; a broken link or a docstring that cannot be read fails. With SERVE=1 it is served, for its search.
+docs: $(STAMP)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	@echo "build/site/index.html"
+	$(if $(SERVE),$(BIN)/python -m http.server --bind 127.0.0.1 --directory build/site 8000)
 
 clean:
 	rm -rf $(VENV) .venv-rllib build *.egg-info covis-demo

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..envs.colors import CANVAS, FAINT, RIGHT, WRONG, Color, class_color, robot_color
 from ..matching.pose import Array, transform
-from .extras import require
+from .extras import require, require_scene
 from .methods import Method
 from .moments import Moment, Result, Sighting, Source, Things, dataset_source, scene_source
 from .settings import SCENE_NAMES, Settings
@@ -111,7 +111,7 @@ def _strictly() -> Iterator[None]:
 
 def _source(target: str, methods: Sequence[Method], settings: Settings) -> Source:
     if target in SCENE_NAMES or (":" in target and not Path(target).exists()):
-        require("envs")
+        require_scene(settings.perception)
         return scene_source(target, methods, settings)
     if Path(target).is_dir():
         return dataset_source(target, methods, settings)

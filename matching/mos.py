@@ -41,8 +41,8 @@ def mos(
         source, target: the two robots' graphs, n n' <= 1024.
         prior, rng: not used.
         order_weights: weights of the first, second and third order.
-        walk_weight, inflation, iterations, sinkhorn_iterations, tolerance, sinkhorn_tolerance, neighbours_factor,
-            angle_width: as in `rrwhm`.
+        walk_weight, inflation, iterations, sinkhorn_iterations, tolerance, sinkhorn_tolerance: as in `rrwhm`.
+        neighbours_factor, angle_width: as in `rrwhm`.
         distance_width_m2, distance_width_factor: as in `rrwm`.
         attribute_exponent: power of the attribute similarity in the first order; larger trusts classes more.
 

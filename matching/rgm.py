@@ -188,9 +188,10 @@ def rgm(
         noncovisibility_weight: lambda_2. 0 is the ablation `rgm-no-covisibility`.
         acceptance, proposals, start_temperature, end_temperature, add_probability, proposal_width: see `Annealing`.
         scaling, count_penalty: see `covis.matching.objective.coefficients`.
-        distance_width_m2, distance_width_factor, angle_width, attribute_uncertainty_width,
-            distance_uncertainty_width_m2, angle_uncertainty_width_m2, uncertainty_width_factor, neighbours, nine_terms,
-            reject_mirrored: see `Similarity`.
+        distance_width_m2, distance_width_factor, angle_width: see `Similarity`.
+        neighbours, nine_terms, reject_mirrored: see `Similarity`.
+        attribute_uncertainty_width, distance_uncertainty_width_m2, angle_uncertainty_width_m2: see `Similarity`.
+        uncertainty_width_factor: see `Similarity`.
         attribute_unit: unit of v in the uncertainty regulariser, probability^2. None: `UNIT_MEDIANS` medians of V.
         position_unit_m2: unit of u there, m^2. None: `UNIT_MEDIANS` medians of U. Give 1 for both to follow the text.
         workers: processes among which the proposals are divided (section 4.2).

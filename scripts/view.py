@@ -24,7 +24,7 @@ def view(
     sequence: Annotated[bool, typer.Option("--sequence", help="Carry a tracker through each episode.")] = False,
     seed: Annotated[int, typer.Option(help="Seed of shuffling, scenes and matchers.")] = 0,
     episodes: Annotated[int | None, typer.Option(help="Of a scene, by default 1; a dataset's first so many.")] = None,
-    perception: Annotated[str, typer.Option(help="simulated | learned.")] = "simulated",
+    perception: Annotated[str, typer.Option(help="Eyes in scenes: learned | simulated.")] = "learned",
 ) -> None:
     """Cameras, boxes, matches, objects with covariances, trajectories and figures over time, as a Rerun recording."""
     try:

@@ -18,7 +18,7 @@ from covis.matching.metrics import Counts
 
 SCENE = "box_world:BoxWorld"
 METHODS = [Method.parse("hungarian:gate_m=1"), Method.parse("random")]
-KNOWN = Settings(pose="known")
+KNOWN = Settings(pose="known", perception="simulated")
 
 
 class Recording:
@@ -130,7 +130,7 @@ def test_a_recorded_dataset_shows_what_the_scene_shows(tmp_path, scene):
     from covis.evaluation.recording import record
 
     folder, file = tmp_path / "boxes", tmp_path / "boxes.rrd"
-    record(SCENE, Settings(episodes=1), folder)
+    record(SCENE, Settings(episodes=1, perception="simulated"), folder)
     view(str(folder), file, METHODS[:1], KNOWN)
     recording = Recording(file)
     for entity in ("/world/robot_0/sensor/camera/boxes", "/world/robot_1/sensor/detections"):
