@@ -111,7 +111,10 @@ def run_unit(unit: Unit, pictures: bool = False) -> UnitResult:
         book = PictureBook(0) if pictures else None
         records = run_scene.run_episodes(experiment.target, unit.episodes, methods, unit.settings, book)
         pages = [] if book is None else book.pages()
-    return UnitResult([replace(r, experiment=experiment.id, seed=unit.seed) for r in records], pages)
+    return UnitResult(
+        [replace(r, experiment=experiment.id, seed=unit.seed) for r in records],
+        [replace(page, seed=unit.seed) for page in pages],
+    )
 
 
 def target_name(experiment: Experiment) -> str:

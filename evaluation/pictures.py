@@ -1,8 +1,8 @@
 """What a report shows of a run beside its numbers: some frames of each unit, with what the robots saw and matched.
 
-A page is one frame. Kept are all frames of a target's first episode (for trajectories; one of them with images), and
-from every unit the worst frame of each of its two best methods, images included. One Parquet file a unit, in
-`pictures/` beside `records/`.
+A page is one frame. Kept are the frames of the unit that holds a target's first episode (for trajectories; one of them
+with images), and from every unit the worst frame of each of its two best methods, images included. One Parquet file a
+unit, in `pictures/` beside `records/`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ..matching.metrics import Counts
 from .methods import EVALUATION_ONLY
 
 MAX_EPISODE_PAGES = 60
-"""Frames kept of the first episode, at most."""
+"""Frames kept from the first episode on, at most."""
 WORST_OF = 2
 """The worst frames of so many of a unit's methods are kept."""
 MIN_COMMON = 3
@@ -53,6 +53,7 @@ RESULT = pa.struct(
 SCHEMA = pa.schema(
     [
         ("target", pa.string()),
+        ("seed", pa.int64()),
         ("episode", pa.int64()),
         ("frame", pa.int64()),
         ("role", pa.string()),
@@ -123,6 +124,7 @@ class Page:
     image_size: list[int] | None
     sights: list[Sight]
     results: list[Result]
+    seed: int = 0
 
     def result(self, method: str) -> Result | None:
         return next((r for r in self.results if r.method == method), None)
@@ -136,6 +138,7 @@ class PictureBook:
 
     def __init__(self, first_episode: int) -> None:
         self._first = first_episode
+        self._in_first_unit = False
         self._episode: list[Page] = []
         self._showcase: Page | None = None
         self._worst: dict[str, tuple[tuple[float, int], Page]] = {}
@@ -146,14 +149,15 @@ class PictureBook:
         for method, c in counts.items():
             self._totals[method] = self._totals.get(method, Counts()) + c
         worse = [m for m, c in counts.items() if self._is_worst(m, c)]
-        in_first = episode == self._first and len(self._episode) < MAX_EPISODE_PAGES
-        if not worse and not in_first:
+        self._in_first_unit |= episode == self._first
+        followed = self._in_first_unit and len(self._episode) < MAX_EPISODE_PAGES
+        if not worse and not followed:
             return
         page = make_page()
         for method in worse:
             self._worst[method] = _badness(counts[method]), replace(page, role="worst")
-        if in_first:
-            self._add_to_episode(page)
+        if followed:
+            self._add_to_episode(page, showcase=episode == self._first)
 
     def pages(self) -> list[Page]:
         """What is kept, the first episode before the failures."""
@@ -170,9 +174,9 @@ class PictureBook:
             return False
         return method not in self._worst or _badness(counts) > self._worst[method][0]
 
-    def _add_to_episode(self, page: Page) -> None:
+    def _add_to_episode(self, page: Page, showcase: bool) -> None:
         best = self._showcase
-        if best is None or _most_common(page) > _most_common(best):
+        if showcase and (best is None or _most_common(page) > _most_common(best)):
             if best is not None:
                 self._episode[self._episode.index(best)] = replace(best.without_images(), role="episode")
             self._showcase = replace(page, role="showcase")

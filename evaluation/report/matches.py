@@ -74,7 +74,7 @@ def _side_by_side(group: Group, page: Page, images: Images) -> Element:
             picture = frame(page, [(e.method, result)], images, f"{e.label} on {group.name}: {words(result)}")
             caption = h("figcaption", None, key(e.method), h("strong", None, e.label), " ", words(result))
             figures.append(h("figure", {"class": "frame", "data-m": e.method}, picture, caption))
-    title = h("h3", None, group.name, h("span", {"class": "aka"}, f"episode {page.episode}, frame {page.frame}"))
+    title = h("h3", None, group.name, h("span", {"class": "aka"}, when(page)))
     return h("article", {"data-t": group.number}, title, strip(figures, f"Matches on {group.name}, method by method"))
 
 
@@ -87,6 +87,11 @@ def _rank(entry: Entry) -> int:
     if entry.label in PAPER_ORDER:
         return PAPER_ORDER.index(entry.label)
     return len(PAPER_ORDER) + entry.baseline
+
+
+def when(page: Page, with_frame: bool = True) -> str:
+    """Which frame of the run this is."""
+    return f"seed {page.seed}, episode {page.episode}" + (f", frame {page.frame}" if with_frame else "")
 
 
 def words(result: Result) -> str:
@@ -194,14 +199,14 @@ def _failures_of(group: Group, most: int, images: Images) -> Element | None:
 
 def _failure(group: Group, page: Page, images: Images) -> Element:
     results = [(e.method, r) for e in group.entries if (r := page.result(e.label)) is not None]
-    title = f"{group.name}, episode {page.episode}, frame {page.frame}: two robots’ views with matches"
+    title = f"{group.name}, {when(page)}: two robots’ views with matches"
     picture = frame(page, results, images, title, pick=True)
     told = [h("span", {"data-pick": method}, words(result)) for method, result in results]
     best = max((r.counts.f1, m) for m, r in results if not group_entry(group, m).baseline)
     others = (
         f". Best here: {group_entry(group, best[1]).label}, F1 {best[0]:.2f}." if best[0] else ". No method did better."
     )
-    caption = h("figcaption", None, h("strong", None, f"episode {page.episode}, frame {page.frame}"), " ", told, others)
+    caption = h("figcaption", None, h("strong", None, when(page)), " ", told, others)
     return h("figure", {"class": "frame"}, picture, caption)
 
 

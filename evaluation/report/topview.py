@@ -118,7 +118,7 @@ def _robot(i: int, at: tuple[float, float], name: str) -> Element:
 
 def observers(group: Group, method: str) -> Element | None:
     """Where the observers went, and at some instants the matches between them."""
-    pages = episode(group)
+    pages = next(iter(episodes(group)), [])
     if len(pages) < MIN_FRAMES:
         return None
     tracks = [np.array([_place(p.sights[i].pose) for p in pages]) for i in (0, 1)]
@@ -137,11 +137,14 @@ def observers(group: Group, method: str) -> Element | None:
     return _map(title, [parts, scale_bar(view)])
 
 
-def episode(group: Group) -> list[Page]:
-    """The kept frames of the first episode in time, if the true poses of two robots are known."""
-    pages = sorted((p for p in group.pages if p.role in ("episode", "showcase")), key=lambda p: p.frame)
-    pages = [p for p in pages if len(p.sights) >= 2 and all(s.pose is not None for s in p.sights[:2])]
-    return [p for p in pages if p.episode == pages[0].episode]
+def episodes(group: Group) -> list[list[Page]]:
+    """The kept episodes, each in order of time, in which the true poses of the first two robots are known."""
+    found: dict[tuple[int, int], list[Page]] = {}
+    for page in group.pages:
+        two = page.sights[:2]
+        if page.role != "worst" and len(two) == 2 and all(sight.pose is not None for sight in two):
+            found.setdefault((page.seed, page.episode), []).append(page)
+    return [sorted(pages, key=lambda page: page.frame) for pages in found.values()]
 
 
 def _within(points: Points, tracks: Points) -> Points:
@@ -197,11 +200,17 @@ class Track:
     errors: tuple[float, float]
 
 
-def tracks(group: Group, method: str) -> list[Track]:
+def best_tracks(group: Group, method: str) -> tuple[list[Page], list[Track]]:
+    """The kept episode in which a method followed moving objects longest, and these."""
+    found = [(pages, tracks(pages, method)) for pages in episodes(group)]
+    return max(found, key=lambda x: sum(len(t.single) for t in x[1]), default=([], []))
+
+
+def tracks(pages: Sequence[Page], method: str) -> list[Track]:
     """The moving objects that a method matched rightly most often, each by the observer that saw it most."""
     truth: dict[int, list[list[float]]] = {}
     found: dict[tuple[int, str], list[list[list[float]]]] = {}
-    for page in episode(group):
+    for page in pages:
         for identity, place in _truths(page).items():
             truth.setdefault(identity, []).append(place)
         for identity, observer, *places in _localised(page, method):

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from ..pictures import Page
 from . import topview
 from .curves import section
 from .html import Element, h
 from .leaderboard import key
+from .matches import when
 from .paper import CASE_STUDY_ERROR_M
 from .run import Entry, Group
 
@@ -34,7 +36,8 @@ def _observers(group: Group, entry: Entry) -> Element | None:
     figure = topview.observers(group, entry.label)
     if figure is None:
         return None
-    caption = h("figcaption", None, h("strong", None, group.name), key(entry.method), entry.label)
+    episode = when(topview.episodes(group)[0][0], with_frame=False)
+    caption = h("figcaption", None, h("strong", None, group.name), key(entry.method), f"{entry.label}; {episode}")
     return h("figure", {"class": "panel", "data-t": group.number, "data-m": entry.method}, figure, caption)
 
 
@@ -44,10 +47,10 @@ def figure_10(groups: Sequence[Group]) -> Element | None:
         return None
     single, fused = (1000 * error for error in CASE_STUDY_ERROR_M)
     note = (
-        f"Up to {topview.MAX_TRACKS} moving objects of the first episode, in the frames in which the best method "
-        "matched them rightly (the oracle, where the best method followed nothing that moves): as one observer "
-        "estimates them alone, and fused with the other. Black: truth. The paper’s Fig. 10; its case study reports "
-        f"{single:.1f} mm alone and {fused:.1f} mm fused."
+        f"Up to {topview.MAX_TRACKS} moving objects of an episode, in the frames in which the best method matched them "
+        "rightly (the oracle, where the best method followed nothing that moves): as one observer estimates them "
+        "alone, and fused with the other. Black: truth. Of the kept episodes the one is shown in which objects are followed "
+        f"longest. The paper’s Fig. 10; its case study reports {single:.1f} mm alone and {fused:.1f} mm fused."
     )
     return section("trajectories", "Trajectories: truth, one robot, fused", note, panels)
 
@@ -56,17 +59,17 @@ def _tracks(group: Group) -> list[Element]:
     """One panel alone, one fused: by the best method that followed something, the oracle where there is no other."""
     by_quality = sorted(group.competitors, key=lambda e: -e.f1) + [e for e in group.entries if e.label == "oracle"]
     for entry in by_quality[:1] + [e for e in by_quality if e.label == "oracle"]:
-        found = topview.tracks(group, entry.label)
+        pages, found = topview.best_tracks(group, entry.label)
         if found:
-            return [_panel(group, entry, found, which) for which in ("single", "fused")]
+            return [_panel(group, entry, pages[0], found, which) for which in ("single", "fused")]
     return []
 
 
-def _panel(group: Group, entry: Entry, found: Sequence[topview.Track], which: str) -> Element:
+def _panel(group: Group, entry: Entry, page: Page, found: Sequence[topview.Track], which: str) -> Element:
     what = "one robot alone" if which == "single" else "fused"
     index = 0 if which == "single" else 1
     errors = ", ".join(f"object {t.identity} ({t.observer}) {t.errors[index]:.2f} m" for t in found)
-    words = f"matched by {entry.label}. Mean error: {errors}."
+    words = f"matched by {entry.label}; {when(page, with_frame=False)}. Mean error: {errors}."
     caption = h("figcaption", None, h("strong", None, f"{group.name}: {what}"), words)
     figure = topview.trajectories(group.name, found, which)
     return h("figure", {"class": "panel", "data-t": group.number}, figure, caption)

@@ -46,6 +46,16 @@ def test_of_the_first_episode_one_frame_keeps_its_images():
     assert [p.sights[0].image for p in pages] == [None, b"jpeg", None]
 
 
+def test_the_rest_of_the_first_unit_is_followed_too_but_shows_no_images():
+    book = PictureBook(first_episode=5)
+    for episode, common in ((5, 4), (6, 9)):
+        see(book, episode, episode, {"oracle": 4}, common)
+    assert [(p.frame, p.role) for p in book.pages()] == [(5, "showcase"), (6, "episode")]
+    other = PictureBook(first_episode=5)
+    see(other, 6, 0, {"oracle": 4})
+    assert other.pages() == []
+
+
 def test_pages_survive_parquet():
     pages = [make_page(0), make_page(1).without_images()]
     assert from_table(to_table(pages)) == pages
@@ -56,7 +66,7 @@ def test_a_run_on_a_dataset_writes_pages_that_agree_with_its_records(small_datas
     benchmark([str(small_dataset)], methods, Settings(), out=tmp_path / "run")
     pages = from_table(pq.read_table(tmp_path / "run" / "pictures" / "unit-00000.parquet"))
     records = records_from_table(pq.read_table(tmp_path / "run" / "records" / "unit-00000.parquet"))
-    assert [p.frame for p in pages] == [0, 1, 2]  # the first episode
+    assert [p.frame for p in pages] == [0, 1, 2, 3, 4, 5]  # the first unit
     for page in pages:
         for result in page.results:
             own = [r for r in records if (r.frame, r.method) == (page.frame, result.method)]

@@ -15,7 +15,7 @@ from covis.evaluation.report.html import h, page
 from covis.evaluation.report.leaderboard import signed, verdict
 from covis.evaluation.report.robustness import figure_7, rates
 from covis.evaluation.report.run import Entry, load
-from covis.evaluation.report.topview import tracks
+from covis.evaluation.report.topview import best_tracks, episodes
 
 from .conftest import METHODS, TARGETS, make_record, rows_of, write_run
 
@@ -245,10 +245,18 @@ def test_axes_have_round_ticks_around_the_values():
 
 def test_tracks_follow_what_moves(run_folder):
     group = load(run_folder).groups[0]
-    (track,) = tracks(group, METHODS[0])
+    pages, (track,) = best_tracks(group, METHODS[0])
+    assert [page.frame for page in pages] == [0, 1, 2, 3, 4]
     assert track.identity == 1
     assert len(track.truth) == len(track.single) == 5
     assert track.errors == pytest.approx((0.1, 0.05), abs=1e-6)
+
+
+def test_episodes_of_different_seeds_are_not_mixed(run_folder):
+    group = load(run_folder).groups[0]
+    again = [replace(page, seed=99) for page in group.pages]
+    found = episodes(replace(group, pages=[*group.pages, *again]))
+    assert [(pages[0].seed, len(pages)) for pages in found] == [(0, 5), (99, 5)]
 
 
 def test_html_is_escaped_and_void_elements_stay_open():
