@@ -49,7 +49,7 @@ def figure_10(groups: Sequence[Group]) -> Element | None:
     note = (
         f"Up to {topview.MAX_TRACKS} moving objects of an episode, in the frames in which the best method matched them "
         "rightly (the oracle, where the best method followed nothing that moves): as one observer estimates them "
-        "alone, and fused with the other. Black: truth. Of the kept episodes the one is shown in which objects are followed "
+        "alone, and fused with the other. Black: truth. Shown is the kept episode in which objects are followed "
         f"longest. The paper’s Fig. 10; its case study reports {single:.1f} mm alone and {fused:.1f} mm fused."
     )
     return section("trajectories", "Trajectories: truth, one robot, fused", note, panels)
