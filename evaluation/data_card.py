@@ -27,6 +27,7 @@ COLUMNS: Mapping[str, str] = {
     "attribute": "confidence per class, in the order of `classes` in dataset.json",
     "attribute_variance": "mean variance of the confidences",
     "covariance": "of the position, row-major 3x3, m²",
+    "embedding": "appearance, for re-identification; null where the eyes give none",
     "box": "[u0, v0, u1, v1] px; in `objects` the tight box of the visible pixels",
     "mask": "run lengths, column by column, outside first (COCO's uncompressed RLE); null where the eyes give none",
     "truth": "true position of the object, m, world frame",

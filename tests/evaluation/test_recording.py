@@ -58,6 +58,22 @@ def test_it_scores_as_the_live_scene_does(recorded, pose):
         assert [a[key] for key in same] == [b[key] for key in same]
 
 
+def test_learned_eyes_record_all_that_matchers_saw(tmp_path):
+    pytest.importorskip("torch", reason="learned eyes need covis[learned]")
+    settings = Settings(episodes=1, preset="easy")
+    record("target_localization", settings, tmp_path / "learned")
+    check(tmp_path / "learned")
+    methods = [Method.parse(name) for name in ("reid", "bayes", "oracle")]
+    live = benchmark(["target_localization"], methods, settings)
+    offline = benchmark([str(tmp_path / "learned")], methods, Settings())
+    detections = pq.read_table(tmp_path / "learned" / "detections.parquet")
+    assert detections.num_rows > detections["mask"].null_count == detections["embedding"].null_count == 0
+    for a, b in zip(live, offline, strict=True):
+        assert a["pairs"] > 0
+        for key in ("pairs", "n_correct", "n_retrieved"):
+            assert a[key] == b[key], key
+
+
 def test_masks_and_boxes_are_of_what_the_image_shows(recorded):
     robots, objects = (pq.read_table(recorded / f"{t}.parquet").to_pylist() for t in ("robots", "objects"))
     image = cv2.imdecode(np.frombuffer(robots[0]["image"], np.uint8), cv2.IMREAD_COLOR)
