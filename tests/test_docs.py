@@ -44,7 +44,13 @@ LINK = re.compile(r"\]\((?!https?://|#)([^)#]+)")
 FILE = re.compile(r"# ([\w/]+\.py)\n")
 STAND_IN = "box_world:BoxWorld"
 """A scene that takes a second, in place of the real ones."""
-QUICK = {"benchmark": ["--episodes", "1"], "view": ["--episodes", "1"], "record": ["--episodes", "1"], "check": []}
+QUICK = {
+    "benchmark": ["--episodes", "1"],
+    "view": ["--episodes", "1"],
+    "record": ["--episodes", "1"],
+    "check": [],
+    "export": [],
+}
 """Subcommands that are run, with the options that make them short; others are only parsed."""
 
 
