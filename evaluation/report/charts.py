@@ -9,7 +9,7 @@ from math import ceil, floor, log10
 from .html import Element, h, number
 
 WIDTH, HEIGHT = 360, 270
-LEFT, RIGHT, TOP, BOTTOM = 44, 12, 12, 40
+LEFT, RIGHT, TOP, BOTTOM = 44, 18, 12, 40
 
 
 @dataclass(frozen=True)

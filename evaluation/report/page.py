@@ -69,6 +69,7 @@ def _header(run: Run, sections: Sequence[Element]) -> Element:
     commits = ", ".join(dict.fromkeys(str(s.get("commit") or "unknown") for s in run.sessions))
     started = str(run.sessions[0].get("started", ""))[:10] if run.sessions else ""
     facts = [
+        f"suite {run.suite}" if run.suite else "",
         f"{targets} target{'s' * (targets != 1)}",
         f"{n_methods} method{'s' * (n_methods != 1)}",
         f"commit {commits}",

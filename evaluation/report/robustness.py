@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from .charts import Series, chart, linear_axis, unit_axis
 from .curves import panel, section
 from .html import Element
+from .leaderboard import signed
 from .run import Entry, Group, undisturbed
 
 KINDS = {
@@ -25,7 +26,8 @@ def figure_7(groups: Sequence[Group]) -> Element | None:
         return None
     note = (
         "What the robots report is made worse by a rate before matching. The paper raises the reported uncertainty by "
-        "0 to 15 % (its Fig. 7); beyond it, the noise itself is raised while the report stays. A flat line is robust."
+        "0 to 15 % (its Fig. 7); beyond it, the noise itself is raised while the report stays. A flat line is robust. "
+        "Beside each name: the change from no disturbance to the strongest."
     )
     return section("robustness", "Robustness", note, panels)
 
@@ -37,7 +39,7 @@ def _panel(group: Group, kind: str, measure: str) -> Element | None:
         if len(points) > 1:
             series.append(Series(entry.label, points, entry.method, markers=True))
             change = points[-1][1] - points[0][1]
-            legend.append((entry.method, entry.label, f"{change:+.3f}"))
+            legend.append((entry.method, entry.label, signed(change)))
     if not series:
         return None
     worst = [x for s in series for x, _ in s.points]

@@ -92,7 +92,12 @@ def write_run(folder: Path, rows: bool = True) -> Path:
         e = Experiment(target, kind, target, METHODS, settings, (3,))
         experiments.append(vars(e) | {"settings": vars(settings)})
         units.append([target, 3, list(range(6))])
-    shards.open({"experiments": experiments, "units": units}, SESSION, resume=False, overwrite=False)
+    shards.open(
+        {"suite": "trial", "suite_version": 7, "experiments": experiments, "units": units},
+        SESSION,
+        resume=False,
+        overwrite=False,
+    )
     for number, target in enumerate(TARGETS):
         made = [
             make_record(target, method, episode, frame, rng)

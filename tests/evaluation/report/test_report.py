@@ -125,6 +125,7 @@ def test_every_section_is_there_and_linked(report):
     ]
     assert all(f'<a href="#{name}"' in html for name in sections)
     assert "abc1234567" in html
+    assert "suite trial (version 7)" in html
     assert "3.11.7" in html
 
 
