@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-rllib check docs setup clean
+.PHONY: demo test test-rllib test-torchvision check docs setup clean
 
 setup: $(STAMP)
 
@@ -26,6 +26,12 @@ test-rllib:
 	.venv-rllib/bin/python -m pip install --quiet --editable '.[envs]' 'ray[rllib]' torch==2.13.0 pytest
 	COVIS_TEST_RLLIB=1 .venv-rllib/bin/python -m pytest tests/rllib
 
+# torchvision wants a torch of its own build, and both are large (5.5 GB with CUDA builds): an environment of its own.
+test-torchvision:
+	test -x .venv-torchvision/bin/python || $(PYTHON) -m venv .venv-torchvision
+	.venv-torchvision/bin/python -m pip install --quiet --editable '.[all,torchvision]' torch==2.14.1 torchvision==0.29.1 pytest
+	.venv-torchvision/bin/python -m pytest tests/torchvision
+
 check: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -39,4 +45,4 @@ docs: $(STAMP)
 	$(if $(SERVE),$(BIN)/python -m http.server --bind 127.0.0.1 --directory build/site 8000)
 
 clean:
-	rm -rf $(VENV) .venv-rllib build *.egg-info covis-demo
+	rm -rf $(VENV) .venv-rllib .venv-torchvision build *.egg-info covis-demo

@@ -9,6 +9,7 @@ EXTRAS = {
     "learned": ("torch", "safetensors"),
     "policy": ("torch", "stable_baselines3", "supersuit"),
     "ray": ("ray",),
+    "torchvision": ("torch", "safetensors", "torchvision"),
     "viz": ("matplotlib", "rerun"),
 }
 
@@ -27,5 +28,5 @@ def require(extra: str, otherwise: str = "") -> None:
 def require_scene(perception: str) -> None:
     """What scenes need: the simulators and, for learned eyes, torch. Raises MissingExtraError."""
     require("envs")
-    if perception == "learned":
+    if perception != "simulated":
         require("learned", ", or take the eyes that need no torch: --perception simulated")

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -148,6 +149,8 @@ def perception_benchmark(
     """
     require("envs")
     require("learned")
+    if images < 1:
+        raise ValueError(f"images must be at least 1, got {images}")
     if find_spec("pycocotools") is None:
         raise MissingExtraError("pycocotools is missing: install covis[learned]")
     from ..agents.perception import weights as stored
@@ -168,6 +171,25 @@ def perception_benchmark(
     return rows
 
 
+def weights_of(eyes: str) -> Weights:
+    """The weights that a setting of `--perception` names: `learned` or `learned:FOLDER`.
+
+    Raises:
+        ValueError: another setting.
+        MissingExtraError: what they need is not installed.
+        WeightsError: no weights, or altered ones.
+    """
+    name, _, folder = eyes.partition(":")
+    if name != "learned":
+        raise ValueError(
+            f"only learned eyes are benchmarked: perception must be learned or learned:FOLDER, got {eyes!r}"
+        )
+    require("learned")
+    from ..agents.perception import weights as stored
+
+    return stored.load(Path(folder) if folder else None)
+
+
 def _part_of(progress: Callable[[int, int], None], part: int, size: int, parts: int, done: int) -> None:
     progress(part * size + done, parts * size)
 
@@ -181,13 +203,14 @@ def tally(
     progress: Callable[[int], None] = lambda done: None,
 ) -> Tally:
     """Look at `images` images of a target and count."""
-    from ..agents.perception.learned import LearnedPerception, LearnedPerceptionParams
+    from ..agents.perception.kinds import open_eyes
+    from ..agents.perception.learned import LearnedPerceptionParams
 
     out = Tally()
     env = make_env(target)
     try:
         # AP wants the unsure detections too; the other figures keep those that the eyes would report.
-        eyes = LearnedPerception(env.classes, weights, LearnedPerceptionParams(samples=samples, score=0.05))
+        eyes = open_eyes(weights, env.classes, LearnedPerceptionParams(samples=samples, score=0.05))
         report = LearnedPerceptionParams().score
         for number, image in enumerate(test_images(env, images, seed)):
             seen = eyes.see(image.observation, np.random.default_rng((*seed, number)))

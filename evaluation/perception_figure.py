@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
@@ -9,9 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..matching.pose import Array
+from .perception_benchmark import PerceptionTarget, default_targets, make_env, test_images
 
 if TYPE_CHECKING:
     from ..agents.perception.detections import Detections
+    from ..agents.perception.weights import Weights
 
 Picture = NDArray[np.uint8]
 TITLES = (
@@ -22,6 +25,8 @@ TITLES = (
     "u: position uncertainty, m (1 sigma)",
 )
 GREY = 0.35
+IMAGES = 12
+"""Of each target, from which the figure takes one."""
 BAND = 22
 """Height of the titles, px."""
 
@@ -44,6 +49,36 @@ def figure(image: Picture, found: Detections) -> Picture:
     panels = [image.copy(), _outlined(image, found.masks)]
     panels += [_painted(faded, found, value) for value in values]
     return np.concatenate([_titled(p, title) for p, title in zip(panels, TITLES, strict=True)], axis=1)
+
+
+def save_figure(file: Path, weights: Weights, seed: int = 0) -> None:
+    """Write one row of panels per target of `covis benchmark perception`, in the format that the name asks for.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    rows = [_liveliest(target, weights, seed) for target in default_targets()]
+    file.parent.mkdir(parents=True, exist_ok=True)
+    _, code = cv2.imencode(file.suffix or ".png", cv2.cvtColor(np.concatenate(rows), cv2.COLOR_RGB2BGR))
+    file.write_bytes(code.tobytes())
+
+
+def _liveliest(target: PerceptionTarget, weights: Weights, seed: int) -> Picture:
+    """The figure of the image, of the first few of a target's test images, in which the eyes find the most objects."""
+    from ..agents.perception.frames import TEST_KEY
+    from ..agents.perception.kinds import open_eyes
+
+    env = make_env(target)
+    eyes = open_eyes(weights, env.classes)
+    best, picture = -1, np.zeros((0, 0, 3), np.uint8)
+    try:
+        for number, image in enumerate(test_images(env, IMAGES, (TEST_KEY, seed))):
+            found = eyes(image.observation, np.random.default_rng((seed, number)))
+            if len(found) > best:
+                best, picture = len(found), figure(image.observation["image"], found)
+    finally:
+        env.close()
+    return picture
 
 
 def _outlined(image: Picture, masks: NDArray[np.bool_]) -> Picture:

@@ -13,7 +13,8 @@ from ..matching.pose import Array
 from .perception_benchmark import PerceptionTarget, Tally, default_targets, ence, row, tally
 
 if TYPE_CHECKING:
-    from ..agents.perception.network import Eyes
+    from torch import nn
+
     from ..agents.perception.training import State, TrainingParams
     from ..agents.perception.weights import Calibration, Weights
 
@@ -27,7 +28,7 @@ def known_targets() -> list[PerceptionTarget]:
     return [target for target in default_targets() if not target.ood]
 
 
-def validation_figures(network: Eyes, images: int, seed: int = 0) -> dict[str, float]:
+def validation_figures(network: nn.Module, images: int, seed: int = 0) -> dict[str, float]:
     """Means over the scenes of the main figures, on validation seeds."""
     weights = _weights(network)
     rows = [row(target, found) for target, found in _tallies(weights, images, seed)]
@@ -101,7 +102,7 @@ def _negative_log_likelihood(found: Tally, temperature: float) -> float:
     return total / max(number, 1)
 
 
-def _weights(network: Eyes) -> Weights:
+def _weights(network: nn.Module) -> Weights:
     from ..agents.perception.weights import Weights
 
     return Weights({k: v.detach().clone() for k, v in network.state_dict().items()}, network.params.to_dict())

@@ -75,13 +75,13 @@ def run_episodes(
 
 def make_env(scene: str, settings: Settings, **options: Any) -> CollaborativeEnv:
     preset = scene_preset(scene, settings)
-    sensors = ("image",) if settings.perception == "learned" else ("image", "depth", "instances")
+    sensors = ("image", "depth", "instances") if settings.perception == "simulated" else ("image",)
     return parallel_env(scene, preset=preset, n_robots=settings.n_robots, sensors=sensors, **options)
 
 
 def make_eyes(settings: Settings, env: CollaborativeEnv) -> Perceptor:
     """The run's perceptor. Learned eyes compute on one thread: sums of several would depend on their number."""
-    if settings.perception == "learned":
+    if settings.perception != "simulated":
         import torch
 
         torch.set_num_threads(1)

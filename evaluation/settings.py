@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 PoseKnowledge = Literal["unknown", "known"]
-Perception = Literal["simulated", "learned"]
 
 SCENE_NAMES = ("connected_driving", "multi_robot", "aerial_ground", "target_localization")
 """As in `covis.envs.scenes.SCENES`, which needs the simulators; a test compares the two."""
@@ -31,7 +30,7 @@ class Settings:
         sequence: carry a tracker's state through each episode and pass it as prior.
         seed: of shuffling, scenes and matchers.
         episodes: episodes per scene; on a dataset, the first so many (None = all).
-        perception: eyes of the robots in scenes.
+        perception: eyes of the robots in scenes: `learned`, `learned:FOLDER` with weights of that folder, `simulated`.
         n_robots: robots with cameras in scenes; None = the scene's own number.
     """
 
@@ -41,14 +40,14 @@ class Settings:
     sequence: bool = False
     seed: int = 0
     episodes: int | None = None
-    perception: Perception = "learned"
+    perception: str = "learned"
     n_robots: int | None = None
 
     def __post_init__(self) -> None:
         if self.pose not in get_args(PoseKnowledge):
             raise ValueError(f"pose must be one of {', '.join(get_args(PoseKnowledge))}, got {self.pose!r}")
-        if self.perception not in get_args(Perception):
-            raise ValueError(f"perception must be one of {', '.join(get_args(Perception))}, got {self.perception!r}")
+        if self.perception not in ("learned", "simulated") and not self.perception.startswith("learned:"):
+            raise ValueError(f"perception must be learned, learned:FOLDER or simulated, got {self.perception!r}")
         if self.sequence and self.pose == "known":
             raise ValueError("sequence gives the matcher a prior of its own: it goes with pose='unknown'")
         if self.min_common < 0:

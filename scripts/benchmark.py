@@ -31,7 +31,11 @@ def benchmark(
     sequence: Annotated[bool, typer.Option("--sequence", help="Carry a tracker through each episode.")] = False,
     seed: Annotated[int | None, typer.Option(help="Seed of shuffling, scenes and matchers.")] = None,
     episodes: Annotated[int | None, typer.Option(help="Episodes per scene, or the first so many of a dataset.")] = None,
-    perception: Annotated[str | None, typer.Option(help="Eyes in scenes: learned (default) | simulated.")] = None,
+    perception: Annotated[
+        str | None, typer.Option(help="Eyes in scenes: learned (default) | learned:FOLDER | simulated.")
+    ] = None,
+    images: Annotated[int | None, typer.Option(help="perception: images per scene (300).")] = None,
+    figure: Annotated[Path | None, typer.Option(help="perception: picture of what the eyes see.")] = None,
     workers: Annotated[int, typer.Option(help="Processes; on Ray, units at a time (1: one per CPU).")] = 1,
     engine: Annotated[str, typer.Option(help="local | ray.")] = "local",
     ray_address: Annotated[str | None, typer.Option(help="A running Ray cluster: auto, or HOST:PORT.")] = None,
@@ -42,7 +46,7 @@ def benchmark(
 ) -> None:
     """Score matchers by precision, recall, F1, calibration and displacement error."""
     if "perception" in targets:
-        _perception(targets, seed or 0, json_target)
+        _perception(targets, seed or 0, perception or "learned", images, figure, json_target)
         return
     given = {"pose": pose, "preset": preset, "min_common": min_common, "sequence": sequence or None, "seed": seed}
     changes = {"episodes": episodes, "perception": perception}
@@ -97,15 +101,21 @@ def _interrupted(out_dir: Path | None) -> NoReturn:
     raise typer.Exit(130)
 
 
-def _perception(targets: list[str], seed: int, json_target: str | None) -> None:
-    """`covis benchmark perception`: the shipped eyes alone, on test scenes."""
-    from ..evaluation.perception_benchmark import perception_benchmark, table_columns
+def _perception(
+    targets: list[str], seed: int, eyes: str, images: int | None, figure: Path | None, json_target: str | None
+) -> None:
+    """`covis benchmark perception`: learned eyes alone, on test scenes."""
+    from ..evaluation.perception_benchmark import IMAGES, perception_benchmark, table_columns, weights_of
+    from ..evaluation.perception_figure import save_figure
 
     try:
         if targets != ["perception"]:
             raise ValueError(f"perception is benchmarked alone, got the targets {' '.join(targets)}")
+        weights = weights_of(eyes)
         with progress_bar("perception") as progress:
-            rows = perception_benchmark(seed=seed, progress=progress)
+            rows = perception_benchmark(weights=weights, images=images or IMAGES, seed=seed, progress=progress)
+        if figure is not None:
+            save_figure(figure, weights, seed)
     except (ValueError, RuntimeError) as error:
         fail(error)
     write_rows(rows, json_target)

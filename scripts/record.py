@@ -30,7 +30,7 @@ def record(
     """Record episodes of a scene in the dataset format, with images, masks, poses and truth."""
     try:
         require_scene(perception)
-        settings = Settings(preset=preset, seed=seed, episodes=episodes, perception=perception)  # type: ignore[arg-type]
+        settings = Settings(preset=preset, seed=seed, episodes=episodes, perception=perception)
         with progress_bar(f"record {scene}") as progress:
             record_scene(
                 scene, settings, folder, workers=workers, resume=resume, overwrite=overwrite, progress=progress

@@ -29,6 +29,9 @@ def perception(
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")] = False,
     seed: Annotated[int, typer.Option(help="Of frames, batches, dropout and first weights.")] = 0,
     workers: Annotated[int, typer.Option(help="Processes that learn side by side, one thread each.")] = 2,
+    network: Annotated[
+        str, typer.Option(help="compact (ours) | maskrcnn (the paper's; needs torchvision).")
+    ] = "compact",
     validation_images: Annotated[int, typer.Option(help="Per scene, for figures on the way; 0 = none.")] = 16,
     calibration_images: Annotated[int, typer.Option(help="Per scene, to calibrate uncertainty; 0 = do not.")] = 120,
 ) -> None:
@@ -39,14 +42,16 @@ def perception(
     """
     try:
         require("envs")
-        require("learned")
+        require("torchvision" if network == "maskrcnn" else "learned")
         import torch
 
         from ..agents.perception.training import TrainingParams, train
         from ..evaluation.perception_training import finish, validation_figures
 
         torch.set_num_threads(1)
-        params = TrainingParams(minutes=None if steps else minutes, steps=steps, seed=seed, workers=workers)
+        params = TrainingParams(
+            minutes=None if steps else minutes, steps=steps, seed=seed, workers=workers, network=network
+        )
         state = train(
             params,
             out,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .detections import Detections, Perceptor
@@ -14,21 +15,28 @@ __all__ = ["Detections", "Perceptor", "SimulatedPerception", "SimulatedPerceptio
 
 
 def make_perceptor(name: str, env: CollaborativeEnv) -> Perceptor:
-    """Eyes for an environment: `simulated`, or `learned` with the weights that come with the package.
+    """Eyes for an environment.
+
+    Args:
+        name: `simulated`, `learned` with the weights that come with the package, or `learned:FOLDER` with those that
+            `covis train perception --out FOLDER` has left, whichever network they are of.
 
     Raises:
         ValueError: no perception of that name; classes that the weights do not know.
-        ImportError: `learned` without the packages of the extra `learned`.
+        ImportError: `learned` without the packages of the extra `learned`, or what the weights' network needs.
         covis.agents.perception.weights.WeightsError: weights are missing or altered.
     """
+    kind, _, folder = name.partition(":")
     if name == "simulated":
         return SimulatedPerception(env.world.classes)
-    if name == "learned":
+    if name == "learned" or (kind == "learned" and folder):
         try:
-            from .learned import LearnedPerception
+            from . import weights
+            from .kinds import open_eyes
         except ImportError as error:
             raise ImportError(
                 f"learned perception needs torch and safetensors: install covis[learned] ({error})"
             ) from error
-        return LearnedPerception(env.classes, image_size=(env.width, env.height))
-    raise ValueError(f"no perception is called {name!r}; there are simulated, learned")
+        stored = weights.load(Path(folder) if folder else None)
+        return open_eyes(stored, env.classes, image_size=(env.width, env.height))
+    raise ValueError(f"no perception is called {name!r}; there are simulated, learned, learned:FOLDER")

@@ -189,6 +189,26 @@ def full_masks(
 
 
 @njit(cache=True)
+def tight_boxes(masks: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Tight boxes (k, 4) px of masks (k, H, W), zeros where a mask is empty."""
+    k, height, width = masks.shape
+    out = np.zeros((k, 4))
+    for i in range(k):
+        empty = True
+        for v in range(height):
+            for u in range(width):
+                if not masks[i, v, u]:
+                    continue
+                if empty:
+                    out[i, 0], out[i, 1], out[i, 2] = u, v, u + 1
+                    empty = False
+                out[i, 0] = min(out[i, 0], u)
+                out[i, 2] = max(out[i, 2], u + 1)
+                out[i, 3] = v + 1
+    return out
+
+
+@njit(cache=True)
 def spread_pixels(
     masks: NDArray[np.bool_], pixels: NDArray[np.int64], tight: NDArray[np.float64], number: int
 ) -> Array32:

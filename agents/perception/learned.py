@@ -125,8 +125,11 @@ class LearnedPerception:
             )
         self.classes = tuple(classes)
         self._class_index = torch.tensor([known.index(c) for c in classes])
-        self.network = build(weights)
+        self.network = self._build(weights)
         self.last: Seen | None = None
+
+    def _build(self, weights: stored.Weights) -> nn.Module:
+        return build(weights)
 
     @classmethod
     def from_folder(cls, folder: Path, classes: Sequence[str], **options: Any) -> LearnedPerception:
@@ -145,7 +148,7 @@ class LearnedPerception:
     @torch.inference_mode()
     def see(self, observation: Mapping[str, Any], rng: np.random.Generator) -> Seen:
         """Like calling, with all there is to know."""
-        clock = _Clock()
+        clock = Clock()
         image = self._checked(observation)
         height, width = image.shape[:2]
         K = np.asarray(observation["intrinsics"], dtype=np.float64)
@@ -226,11 +229,7 @@ class LearnedPerception:
         T = self.params.samples
         sampled = features.expand(T, *features.shape)
         logits = self.network.class_logits(sampled, T > 1, generator)[..., self._class_index]
-        p = torch.softmax(logits / self.calibration.class_temperature, dim=2).double().numpy()
-        mean = p.mean(axis=0)  # Eq. (6)
-        epistemic = p.var(axis=0)
-        aleatoric = (p * (1 - p)).mean(axis=0)
-        return mean / mean.sum(axis=1, keepdims=True), (epistemic + aleatoric).mean(axis=1)
+        return class_uncertainty(logits, self.calibration.class_temperature)
 
     def _depths(
         self, dense: DenseFeatures, geometry: Geometry, found: _Found, generator: torch.Generator
@@ -244,9 +243,12 @@ class LearnedPerception:
         box = found.boxes[:, None].expand(n, D, 4).reshape(-1, 4)
         seen = depth_features(dense, geometry, image, pixels.reshape(-1, 2), box)
         log_depth, log_variance = self.network.depth(seen, T > 1, generator, draws=T)
-        unit = self.calibration.scale * float(geometry.focal[0]) / REFERENCE_FOCAL_PX
-        z = unit * torch.exp(log_depth.double().view(T, n, D))
-        aleatoric = (z**2 * torch.exp(log_variance.double().view(T, n, D))).mean(0)
+        return self._summarised(log_depth.view(T, n, D), log_variance.view(T, n, D), float(geometry.focal[0]))
+
+    def _summarised(self, log_depth: Tensor, log_variance: Tensor, focal: float) -> tuple[Array, Array, Array]:
+        """Depth (n,), its variance and the epistemic part of that, of samples (T, n, pixels)."""
+        z = self.calibration.scale * focal / REFERENCE_FOCAL_PX * torch.exp(log_depth.double())
+        aleatoric = (z**2 * torch.exp(log_variance.double())).mean(0)
         epistemic = z.var(0, unbiased=False)
         factor = self.calibration.depth
         return (
@@ -269,22 +271,62 @@ class LearnedPerception:
         size = (found.boxes[:, 2:] - found.boxes[:, :2]).clamp(min=2.0)
         pixel = (found.at + found.centre * size).double().numpy()
         pixel_variance = np.exp(found.centre_log_variance.double().numpy()) * (size.double().numpy() ** 2).mean(axis=1)
-        ray = rays(pixel, K)
-        positions = ray * depth[:, None]
-        u = depth_variance * (ray**2).sum(axis=1)  # of the distance along the ray
-        across = (depth / K[0, 0]) ** 2 * np.maximum(pixel_variance * self.calibration.centre, 0.05)
-        return ObjectGraph(
-            positions=positions,
+        return graph_of(
+            pixel=pixel,
+            pixel_variance=pixel_variance * self.calibration.centre,
+            depth=depth,
+            depth_variance=depth_variance,
             attributes=attributes,
-            position_variance=u,
             attribute_variance=v,
-            covariances=ray_covariances(positions, u, across),
-            up=up / np.linalg.norm(up),
-            forward=np.array([0.0, 0.0, 1.0]),
-            embedding=found.embedding.double().numpy(),
             intrinsics=K,
+            up=up,
             image_size=image_size,
+            embedding=found.embedding.double().numpy(),
         )
+
+
+def class_uncertainty(logits: Tensor, temperature: float) -> tuple[Array, Array]:
+    """Class distributions (n, c), Eq. (6), and their uncertainty v (n,), section 3.3.1, of samples (T, n, c)."""
+    p = torch.softmax(logits / temperature, dim=2).double().numpy()
+    mean = p.mean(axis=0)  # Eq. (6)
+    epistemic = p.var(axis=0)
+    aleatoric = (p * (1 - p)).mean(axis=0)
+    return mean / mean.sum(axis=1, keepdims=True), (epistemic + aleatoric).mean(axis=1)
+
+
+def graph_of(
+    *,
+    pixel: Array,
+    pixel_variance: Array,
+    depth: Array,
+    depth_variance: Array,
+    attributes: Array,
+    attribute_variance: Array,
+    intrinsics: Array,
+    up: Array,
+    image_size: tuple[int, int],
+    embedding: Array | None = None,
+) -> ObjectGraph:
+    """The graph of n objects whose centres project to `pixel` (n, 2), at `depth` (n,) m along the optical axis.
+
+    `pixel_variance` (n,) px^2 is per axis; `depth_variance` (n,) m^2.
+    """
+    ray = rays(pixel, intrinsics)
+    positions = ray * depth[:, None]
+    u = depth_variance * (ray**2).sum(axis=1)  # of the distance along the ray
+    across = (depth / intrinsics[0, 0]) ** 2 * np.maximum(pixel_variance, 0.05)
+    return ObjectGraph(
+        positions=positions,
+        attributes=attributes,
+        position_variance=u,
+        attribute_variance=attribute_variance,
+        covariances=ray_covariances(positions, u, across),
+        up=up / np.linalg.norm(up),
+        forward=np.array([0.0, 0.0, 1.0]),
+        embedding=embedding,
+        intrinsics=intrinsics,
+        image_size=image_size,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -303,7 +345,7 @@ class _Found:
     tight: Array
 
 
-class _Clock:
+class Clock:
     """Milliseconds of the stages that end with each `lap`."""
 
     def __init__(self) -> None:

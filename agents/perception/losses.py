@@ -55,6 +55,7 @@ class Batch:
         locations: (k, LOCATIONS, 2) px.
         mask_points, mask_labels: (k, MASK_POINTS, 2) px, (k, MASK_POINTS) in {0, 1}.
         depth_points: (k, DEPTH_POINTS, 2) px.
+        masks: (k, H, W) uint8, visible pixels, where asked for.
     """
 
     images: Tensor
@@ -75,13 +76,16 @@ class Batch:
     mask_points: Tensor
     mask_labels: Tensor
     depth_points: Tensor
+    masks: Tensor | None = None
 
     @property
     def geometry(self) -> Geometry:
         return Geometry.of(self.intrinsics, self.up)
 
 
-def make_batch(pairs: Sequence[tuple[Frame, Frame]], rng: np.random.Generator, augment: bool = True) -> Batch:
+def make_batch(
+    pairs: Sequence[tuple[Frame, Frame]], rng: np.random.Generator, augment: bool = True, masks: bool = False
+) -> Batch:
     """A batch of pairs of frames; with `augment` some mirrored, and their light and sharpness varied."""
     frames = [frame.mirrored() if augment and rng.random() < 0.5 else frame for pair in pairs for frame in pair]
     height, width = frames[0].instances.shape
@@ -103,8 +107,15 @@ def make_batch(pairs: Sequence[tuple[Frame, Frame]], rng: np.random.Generator, a
         up=torch.from_numpy(np.stack([f.up for f in frames])).float(),
         heat=torch.from_numpy(heat),
         heat_weight=torch.from_numpy(weight),
+        masks=torch.from_numpy(_masks(frames)) if masks else None,
         **{name: _stacked(values, _PER_OBJECT[name]) for name, values in rows.items()},
     )
+
+
+def _masks(frames: Sequence[Frame]) -> NDArray[np.uint8]:
+    height, width = frames[0].instances.shape
+    found = [f.instances == obj for f in frames for obj in np.flatnonzero(f.objects.pixels >= MIN_PIXELS)]
+    return np.array(found, np.uint8).reshape(-1, height, width)
 
 
 _PER_OBJECT: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
@@ -245,8 +256,8 @@ def _object_losses(
         "box": box_loss,
         "mask": mask_loss(mask, batch.mask_labels),
         "classes": F.cross_entropy(logits, repeated),
-        "depth": _gaussian(error, log_variance.view(k, DEPTH_POINTS), batch.located[:, None]),
-        "centre": _gaussian(
+        "depth": gaussian_loss(error, log_variance.view(k, DEPTH_POINTS), batch.located[:, None]),
+        "centre": gaussian_loss(
             out.centre - ((batch.centre[:, None] - batch.locations) / size[:, None]).reshape(-1, 2),
             out.centre_log_variance[:, None],
             batch.located[:, None].expand(k, LOCATIONS).reshape(-1, 1),
@@ -271,7 +282,7 @@ def mask_loss(logits: Tensor, labels: Tensor) -> Tensor:
     return F.binary_cross_entropy_with_logits(logits, labels) + dice.mean()
 
 
-def _gaussian(error: Tensor, log_variance: Tensor, valid: Tensor) -> Tensor:
+def gaussian_loss(error: Tensor, log_variance: Tensor, valid: Tensor) -> Tensor:
     """Negative log-likelihood, each term weighted by its own deviation (beta-NLL, beta = 1/2), and a share of plain L1.
 
     Without the weight, errors that are predicted to be large stop being learned from.

@@ -23,8 +23,8 @@ import torch
 from torch import Tensor, nn
 
 from .frames import Frame, FrameSource, Variant, joint_classes, training_variants
-from .losses import LossWeights, losses, make_batch
-from .network import Eyes, NetworkParams
+from .kinds import KIND, kind, network_params
+from .losses import LossWeights, make_batch
 
 CHECKPOINT = "checkpoint.pt"
 LOG = "training.jsonl"
@@ -53,6 +53,7 @@ class TrainingParams:
         checkpoint_s: time between checkpoints.
         validate_s: time between validations.
         variants: scenes to learn from.
+        network: what to train, see `kinds.kind`.
     """
 
     minutes: float | None = 40.0
@@ -72,6 +73,7 @@ class TrainingParams:
     validate_s: float = 300.0
     weights: LossWeights = field(default_factory=LossWeights)
     variants: tuple[Variant, ...] = field(default_factory=training_variants)
+    network: str = "compact"
 
     def __post_init__(self) -> None:
         if (self.minutes is None) == (self.steps is None):
@@ -117,20 +119,22 @@ class Pool:
 class State:
     """All that changes in training."""
 
-    network: Eyes
-    averaged: Eyes
+    network: nn.Module
+    averaged: nn.Module
     optimiser: torch.optim.Optimizer
     step: int = 0
     seconds: float = 0.0
     images: int = 0
 
 
-def fresh(params: TrainingParams, network: NetworkParams | None = None) -> State:
-    """A state to begin with."""
+def fresh(params: TrainingParams, network: Any = None) -> State:
+    """A state to begin with; `network` gives other sizes than the usual ones."""
+    build = kind(params.network).build
+    network = network_params(params.network, joint_classes()) if network is None else network
     with torch.random.fork_rng():
         torch.manual_seed(params.seed)
-        net = Eyes(network or NetworkParams(joint_classes())).to(memory_format=torch.channels_last)
-    averaged = Eyes(net.params).to(memory_format=torch.channels_last)
+        net = build(network).to(memory_format=torch.channels_last)
+    averaged = build(network).to(memory_format=torch.channels_last)
     averaged.load_state_dict(net.state_dict())
     averaged.requires_grad_(False)
     return State(net, averaged, _optimiser(net, params))
@@ -141,8 +145,8 @@ def train(
     out: Path,
     *,
     resume: bool = False,
-    network: NetworkParams | None = None,
-    validate: Callable[[Eyes], dict[str, float]] | None = None,
+    network: Any = None,
+    validate: Callable[[nn.Module], dict[str, float]] | None = None,
     report: Callable[[dict[str, Any]], None] = lambda row: None,
     report_s: float = 10.0,
 ) -> State:
@@ -184,7 +188,7 @@ class _Book:
         state: State,
         path: Path,
         logs: Sequence[Callable[[dict[str, Any]], None]],
-        validate: Callable[[Eyes], dict[str, float]] | None,
+        validate: Callable[[nn.Module], dict[str, float]] | None,
         report_s: float,
     ) -> None:
         self.params, self.state, self.path = params, state, path
@@ -271,7 +275,7 @@ class _Team:
             self.barrier.wait()
         return done < 1
 
-    def meet(self, worker: int, network: Eyes) -> None:
+    def meet(self, worker: int, network: nn.Module) -> None:
         """Average the weights of all workers."""
         if self.processes:
             _meet(worker, network, self.flat, self.barrier)
@@ -281,7 +285,7 @@ MEETING_TIMEOUT_S = 900.0
 
 
 def _work(
-    worker: int, params: TrainingParams, network: NetworkParams, step: int, flat: Tensor, plan: Tensor, barrier: Any
+    worker: int, params: TrainingParams, network: Any, step: int, flat: Tensor, plan: Tensor, barrier: Any
 ) -> None:
     """The life of a worker but the first."""
     torch.set_num_threads(1)
@@ -313,7 +317,7 @@ def _die_with_parent() -> None:
         os._exit(1)
 
 
-def _meet(worker: int, network: Eyes, flat: Tensor, barrier: Any) -> None:
+def _meet(worker: int, network: nn.Module, flat: Tensor, barrier: Any) -> None:
     flat[worker] = _flat(network)
     barrier.wait()
     mean = flat.mean(0)
@@ -321,13 +325,13 @@ def _meet(worker: int, network: Eyes, flat: Tensor, barrier: Any) -> None:
     _unflatten(mean, network)
 
 
-def _flat(network: Eyes) -> Tensor:
+def _flat(network: nn.Module) -> Tensor:
     """All weights and running means as one vector."""
     return torch.cat([v.detach().flatten() for v in network.state_dict().values() if v.dtype.is_floating_point])
 
 
 @torch.no_grad()
-def _unflatten(flat: Tensor, network: Eyes) -> None:
+def _unflatten(flat: Tensor, network: nn.Module) -> None:
     start = 0
     for value in network.state_dict().values():
         if value.dtype.is_floating_point:
@@ -345,11 +349,12 @@ def train_step(state: State, pool: Pool, params: TrainingParams, done: float, wo
     generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
     pairs = pool.at(params.pool_chunks - 1 + state.step // params.steps_per_chunk)
     chosen = [pairs[i] for i in rng.choice(len(pairs), min(params.pairs, len(pairs)), replace=False)]
-    batch = make_batch(chosen, rng)
+    learner = kind(params.network)
+    batch = make_batch(chosen, rng, masks=learner.masks)
     for group in state.optimiser.param_groups:
         group["lr"] = params.learning_rate * schedule(done, params.warm_up)
     state.optimiser.zero_grad(set_to_none=True)
-    parts = losses(state.network, batch, params.weights, generator, bf16=params.bf16)
+    parts = learner.losses(state.network, batch, params.weights, generator, bf16=params.bf16)
     parts["total"].backward()
     nn.utils.clip_grad_norm_(state.network.parameters(), 10.0)
     state.optimiser.step()
@@ -373,7 +378,7 @@ def _progress(state: State, params: TrainingParams) -> float:
     return state.seconds / (60 * params.minutes)
 
 
-def _optimiser(network: Eyes, params: TrainingParams) -> torch.optim.Optimizer:
+def _optimiser(network: nn.Module, params: TrainingParams) -> torch.optim.Optimizer:
     decayed = [p for p in network.parameters() if p.ndim > 1]
     plain = [p for p in network.parameters() if p.ndim <= 1]
     groups = [{"params": decayed, "weight_decay": params.weight_decay}, {"params": plain, "weight_decay": 0.0}]
@@ -381,7 +386,7 @@ def _optimiser(network: Eyes, params: TrainingParams) -> torch.optim.Optimizer:
 
 
 @torch.no_grad()
-def _average(averaged: Eyes, network: Eyes, decay: float) -> None:
+def _average(averaged: nn.Module, network: nn.Module, decay: float) -> None:
     for mean, value in zip(averaged.state_dict().values(), network.state_dict().values(), strict=True):
         if mean.dtype.is_floating_point:
             mean.lerp_(value, 1 - decay)
@@ -412,7 +417,7 @@ def load_checkpoint(path: Path, state: State) -> None:
         ValueError: it belongs to another network.
     """
     content = torch.load(path, weights_only=True)
-    params = NetworkParams.from_dict(content["params"])
+    params = kind(content["params"].get(KIND, "compact")).params(content["params"])
     if params != state.network.params:
         raise ValueError(f"{path} holds another network: {params}, expected {state.network.params}")
     state.network.load_state_dict(content["network"])

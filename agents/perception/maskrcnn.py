@@ -1,0 +1,315 @@
+"""The paper's own eyes: Mask R-CNN with dropout in its box head, and depth from a second ResNet-50 with dropout.
+
+Sections 3.1, 3.3.1 and 3.3.2 on torchvision's building blocks, trained from nothing (no weights are downloaded). It is
+far larger than `network.py` and far slower on a CPU: it is here to compare with.
+Backbones, proposals and the first layer of each head run once per image; T samples are drawn of what follows.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torchvision.models.detection import MaskRCNN
+from torchvision.models.detection.backbone_utils import resnet_fpn_backbone
+from torchvision.models.detection.roi_heads import paste_masks_in_image
+from torchvision.ops import batched_nms, clip_boxes_to_image
+
+from ...matching.pose import Array
+from . import weights as stored
+from .decode import spread_pixels, tight_boxes
+from .detections import Detections
+from .learned import Clock, LearnedPerception, Seen, class_uncertainty, graph_of
+from .losses import Batch, LossWeights, gaussian_loss
+from .network import REFERENCE_FOCAL_PX, bilinear, dropout
+
+STRIDE = 4
+"""Of the features from which depth is read."""
+CHANNELS = 256
+"""Of torchvision's feature pyramid."""
+NMS_IOU = 0.5
+CENTRE_STD = 0.1
+"""1 sigma of the projected centre before calibration, in sizes of the box."""
+
+
+@dataclass(frozen=True)
+class MaskRCNNParams:
+    """Sizes of the network.
+
+    Attributes:
+        classes: names, in the order of the class head (which has the background before them).
+        backbone: of torchvision's ResNets, for detection and for depth.
+        image_size: (width, height) at which the network looks; other images are scaled to it.
+        proposals: regions that reach the box head of one image.
+        representation: width of the box head.
+        dropout: rate in the box head and in the depth head.
+    """
+
+    kind: ClassVar[str] = "maskrcnn"
+
+    classes: tuple[str, ...]
+    backbone: str = "resnet50"
+    image_size: tuple[int, int] = (320, 240)
+    proposals: int = 128
+    representation: int = 1024
+    dropout: float = 0.3
+
+    def __post_init__(self) -> None:
+        if not self.classes or len(set(self.classes)) != len(self.classes):
+            raise ValueError(f"classes must be distinct and at least one, got {self.classes!r}")
+        if not 0 <= self.dropout < 1:
+            raise ValueError(f"dropout must be in [0, 1), got {self.dropout}")
+
+    def to_dict(self) -> dict[str, Any]:
+        return dataclasses.asdict(self) | {"kind": self.kind}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> MaskRCNNParams:
+        plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items() if k != "kind"}
+        return cls(**plain)
+
+
+class BoxHead(nn.Module):
+    """Two layers, dropout before and after the second; what comes before all dropout is computed once."""
+
+    def __init__(self, width: int, rate: float) -> None:
+        super().__init__()
+        self.first = nn.Linear(CHANNELS * 7 * 7, width)
+        self.second = nn.Linear(width, width)
+        self.rate = rate
+
+    def forward(self, pooled: Tensor) -> Tensor:
+        """Training: one draw from the dropout posterior, by torch's global generator."""
+        return self.sample(self.before(pooled), self.rate if self.training else 0.0, None)
+
+    def before(self, pooled: Tensor) -> Tensor:
+        return F.relu(self.first(pooled.flatten(1)))
+
+    def sample(self, hidden: Tensor, rate: float, generator: torch.Generator | None) -> Tensor:
+        hidden = F.relu(self.second(dropout(hidden, rate, generator)))
+        return dropout(hidden, rate, generator)
+
+
+class DepthNetwork(nn.Module):
+    """Log depth of the object that a pixel belongs to, over the focal length, and its log-variance."""
+
+    def __init__(self, backbone: str, rate: float) -> None:
+        super().__init__()
+        self.features = _pyramid(backbone)
+        self.smooth = nn.Sequential(nn.Conv2d(CHANNELS, 128, 3, padding=1), nn.ReLU(inplace=True))
+        self.hidden = nn.Linear(128, 128)
+        self.out = nn.Linear(128, 2)
+        self.rate = rate
+        nn.init.normal_(self.out.weight, std=0.02)
+        with torch.no_grad():
+            self.out.bias.copy_(torch.tensor([2.0, -2.0]))
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Maps (b, H/4, W/4, 128)."""
+        return self.smooth(self.features(images)["0"]).permute(0, 2, 3, 1)
+
+    def read(self, seen: Tensor, sample: bool, generator: torch.Generator | None, draws: int) -> tuple[Tensor, Tensor]:
+        """Log depth and log-variance (draws, k) of map values (k, 128)."""
+        rate = self.rate if sample else 0.0
+        hidden = F.relu(self.hidden(dropout(seen.expand(draws, *seen.shape), rate, generator)))
+        out = self.out(dropout(hidden, rate, generator))
+        return out[..., 0], out[..., 1].clamp(-12, 3)
+
+
+class PaperNetwork(nn.Module):
+    """Both networks; see the module's docstring."""
+
+    def __init__(self, params: MaskRCNNParams) -> None:
+        super().__init__()
+        self.params = params
+        width, height = params.image_size
+        self.detector = MaskRCNN(
+            _pyramid(params.backbone),
+            1 + len(params.classes),
+            min_size=min(width, height),
+            max_size=max(width, height),
+            image_mean=[0.5] * 3,
+            image_std=[0.5] * 3,
+            rpn_pre_nms_top_n_test=4 * params.proposals,
+            rpn_post_nms_top_n_test=params.proposals,
+            rpn_post_nms_top_n_train=4 * params.proposals,
+        )
+        self.detector.roi_heads.box_head = BoxHead(params.representation, params.dropout)
+        predictor = self.detector.roi_heads.box_predictor
+        for layer in ("cls_score", "bbox_pred"):
+            setattr(predictor, layer, nn.Linear(params.representation, getattr(predictor, layer).out_features))
+        self.depth = DepthNetwork(params.backbone, params.dropout)
+
+
+def _pyramid(backbone: str) -> nn.Module:
+    # Batch normalisation learns here: torchvision freezes it by default, for weights that were trained elsewhere.
+    return resnet_fpn_backbone(backbone_name=backbone, weights=None, norm_layer=nn.BatchNorm2d, trainable_layers=5)
+
+
+def losses(
+    network: PaperNetwork, batch: Batch, weights: LossWeights, generator: torch.Generator | None, *, bf16: bool = False
+) -> dict[str, Tensor]:
+    """torchvision's losses of detection, that of depth at pixels of the objects, and their weighted sum as `total`.
+
+    All in float32, whatever `bf16` says: torchvision's pooling of regions knows nothing else on a CPU.
+    """
+    assert batch.masks is not None
+    images = batch.images.permute(0, 3, 1, 2).float() / 255
+    targets = [
+        {
+            "boxes": batch.boxes[batch.image == i],
+            "labels": batch.object_class[batch.image == i] + 1,
+            "masks": batch.masks[batch.image == i],
+        }
+        for i in range(len(images))
+    ]
+    with torch.random.fork_rng(devices=[]):
+        if generator is not None:
+            torch.manual_seed(generator.initial_seed())
+        found = network.detector(list(images), targets)
+    parts = {
+        "heat": found["loss_objectness"],
+        "box": found["loss_rpn_box_reg"] + found["loss_box_reg"],
+        "classes": found["loss_classifier"],
+        "mask": found["loss_mask"],
+    }
+    if len(batch.image):
+        parts["depth"] = _depth_loss(network.depth, images, batch, generator)
+    parts["total"] = torch.stack([getattr(weights, name) * value for name, value in parts.items()]).sum()
+    return parts
+
+
+def _depth_loss(depth: DepthNetwork, images: Tensor, batch: Batch, generator: torch.Generator | None) -> Tensor:
+    k, points = batch.depth_points.shape[:2]
+    image = batch.image[:, None].expand(k, points).reshape(-1)
+    seen = bilinear(depth(2 * images - 1), image, batch.depth_points.reshape(-1, 2), STRIDE)
+    log_depth, log_variance = depth.read(seen, True, generator, 1)
+    wanted = torch.log(batch.depth / (batch.geometry.focal[batch.image] / REFERENCE_FOCAL_PX))
+    error = log_depth.view(k, points) - wanted[:, None]
+    return gaussian_loss(error, log_variance.view(k, points), batch.located[:, None])
+
+
+class MaskRCNNPerception(LearnedPerception):
+    """A perceptor with the paper's network; like `LearnedPerception`, without appearance vectors."""
+
+    network: PaperNetwork
+
+    def _build(self, weights: stored.Weights) -> PaperNetwork:
+        network = PaperNetwork(MaskRCNNParams.from_dict(weights.network))
+        network.load_state_dict(dict(weights.tensors))
+        return network.eval().requires_grad_(False)
+
+    @torch.inference_mode()
+    def see(self, observation: Mapping[str, Any], rng: np.random.Generator) -> Seen:
+        """Like calling, with all there is to know."""
+        clock = Clock()
+        image = self._checked(observation)
+        height, width = image.shape[:2]
+        K = np.asarray(observation["intrinsics"], dtype=np.float64)
+        up = np.asarray(observation["up"], dtype=np.float64)
+        generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+        pixels = torch.from_numpy(image).permute(2, 0, 1).float() / 255
+        found = self._detect(pixels, generator)
+        clock.lap("objects")
+        z, variance, epistemic = self._object_depths(pixels, found, float(K[0, 0]), generator)
+        clock.lap("depth")
+        size = found.tight[:, 2:] - found.tight[:, :2]
+        graph = graph_of(
+            pixel=_centroids(found.masks),
+            pixel_variance=self.calibration.centre * CENTRE_STD**2 * (size**2).mean(axis=1),
+            depth=z,
+            depth_variance=variance,
+            attributes=found.attributes,
+            attribute_variance=found.v,
+            intrinsics=K,
+            up=up,
+            image_size=(width, height),
+        )
+        clock.lap("graph")
+        detections = Detections(graph, found.tight, found.masks)
+        return Seen(detections, found.scores, found.pixels, z, variance, epistemic, clock.laps)
+
+    def _detect(self, image: Tensor, generator: torch.Generator) -> _Objects:
+        detector, p = self.network.detector, self.params
+        roi = detector.roi_heads
+        scaled, _ = detector.transform([image])
+        features = detector.backbone(scaled.tensors)
+        (proposals,), _ = detector.rpn(scaled, features)
+        hidden = roi.box_head.before(roi.box_roi_pool(features, [proposals], scaled.image_sizes))
+        T = p.samples
+        rate = self.network.params.dropout if T > 1 else 0.0
+        logits, moves = roi.box_predictor(
+            roi.box_head.sample(hidden.expand(T, *hidden.shape).flatten(0, 1), rate, generator)
+        )
+        foreground = torch.cat([torch.zeros(1, dtype=torch.int64), 1 + self._class_index])
+        shares = torch.softmax(logits.view(T, len(proposals), -1)[..., foreground], dim=2)
+        scores = 1 - shares.mean(0)[:, 0]
+        label = 1 + self._class_index[shares.mean(0)[:, 1:].argmax(1)]
+        moved = roi.box_coder.decode(moves.view(T, len(proposals), -1).mean(0), [proposals])
+        boxes = clip_boxes_to_image(moved[torch.arange(len(label)), label], scaled.image_sizes[0])
+        keep = batched_nms(boxes, scores, torch.zeros_like(label), NMS_IOU)
+        keep = keep[scores[keep] >= p.score][: p.candidates]
+        masks = self._masks(features, boxes[keep], label[keep], scaled.image_sizes[0], image.shape[1:])
+        pixels = masks.sum((1, 2))
+        seen = pixels >= p.min_pixels
+        keep, masks = keep[seen], masks[seen].numpy()
+        attributes, v = class_uncertainty(
+            logits.view(T, len(proposals), -1)[:, keep][..., 1 + self._class_index], self.calibration.class_temperature
+        )
+        return _Objects(scores[keep].double().numpy(), masks, pixels[seen].numpy(), tight_boxes(masks), attributes, v)
+
+    def _masks(
+        self, features: dict[str, Tensor], boxes: Tensor, label: Tensor, seen: tuple[int, int], size: Any
+    ) -> Tensor:
+        """Masks (n, H, W) bool; a pixel that several claim goes to the surest."""
+        height, width = size
+        if len(boxes) == 0:
+            return torch.zeros((0, height, width), dtype=torch.bool)
+        roi = self.network.detector.roi_heads
+        logits = roi.mask_predictor(roi.mask_head(roi.mask_roi_pool(features, [boxes], [seen])))
+        small = torch.sigmoid(logits[torch.arange(len(label)), label])[:, None]
+        scale = torch.tensor([width / seen[1], height / seen[0]]).repeat(2)
+        full = paste_masks_in_image(small, boxes * scale, (height, width))[:, 0]
+        owner = full.argmax(0)
+        return (full > 0.5) & (owner == torch.arange(len(label))[:, None, None])
+
+    def _object_depths(
+        self, image: Tensor, found: _Objects, focal: float, generator: torch.Generator
+    ) -> tuple[Array, Array, Array]:
+        """As `LearnedPerception` does it: mean over each mask, variance as mean over its pixels, epistemic part."""
+        n, T, D = len(found.scores), self.params.samples, self.params.depth_pixels
+        if n == 0:
+            return np.zeros(0), np.zeros(0), np.zeros(0)
+        pixels = torch.from_numpy(spread_pixels(found.masks, found.pixels, found.tight, D)).reshape(-1, 2)
+        maps = self.network.depth(2 * image[None] - 1)
+        seen = bilinear(maps, torch.zeros(n * D, dtype=torch.int64), pixels, STRIDE)
+        log_depth, log_variance = self.network.depth.read(seen, T > 1, generator, T)
+        return self._summarised(log_depth.view(T, n, D), log_variance.view(T, n, D), focal)
+
+
+@dataclass(frozen=True, eq=False)
+class _Objects:
+    """n objects of one image, best first."""
+
+    scores: Array
+    masks: NDArray[np.bool_]
+    pixels: NDArray[np.int64]
+    tight: Array
+    attributes: Array
+    v: Array
+
+
+def _centroids(masks: NDArray[np.bool_]) -> Array:
+    """Mean pixel (n, 2) of each mask."""
+    out = np.zeros((len(masks), 2))
+    for i, mask in enumerate(masks):
+        v, u = np.nonzero(mask)
+        out[i] = u.mean() + 0.5, v.mean() + 0.5
+    return out
