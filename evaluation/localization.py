@@ -24,7 +24,7 @@ from ..matching.metrics import Counts, count, is_correct, pooled
 from ..matching.multiway import consistent, is_consistent
 from ..matching.pose import Array
 from .localization_team import FAULTS, BayesMatches, Fault, Instant, Sight, TrueMatches, instants, play
-from .settings import Perception, Settings
+from .settings import Settings
 
 Row = dict[str, Any]
 Mask = NDArray[np.bool_]
@@ -86,7 +86,7 @@ def localization_rows(
     *,
     seed: int = 9001,
     episodes: int | None = None,
-    perception: Perception = "simulated",
+    perception: str = "simulated",
     min_score: float = MIN_SCORE,
     progress: Progress = lambda done, total: None,
 ) -> list[Row]:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any
 
 import typer
 from rich.table import Table
 
 from ..evaluation.extras import require
 from ..evaluation.figures import save, team_figure
-from ..evaluation.settings import Perception
 from .console import fail, out, progress_bar, write_rows
 
 COLUMNS = {
@@ -52,14 +51,12 @@ def localize(
             require("viz")
         from ..evaluation.localization import MIN_SCORE, PARTS, localization_rows
 
-        if perception not in get_args(Perception):
-            raise ValueError(f"perception must be one of {', '.join(get_args(Perception))}, got {perception!r}")
         with progress_bar("localize") as progress:
             rows = localization_rows(
                 parts or PARTS,
                 seed=seed,
                 episodes=episodes,
-                perception=perception,  # type: ignore[arg-type]
+                perception=perception,
                 min_score=MIN_SCORE if min_score is None else min_score,
                 progress=progress,
             )
