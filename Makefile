@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-rllib test-torchvision check docs setup clean
+.PHONY: demo test test-rllib test-torchvision check docs results setup clean
 
 setup: $(STAMP)
 
@@ -43,6 +43,20 @@ docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 	@echo "build/site/index.html"
 	$(if $(SERVE),$(BIN)/python -m http.server --bind 127.0.0.1 --directory build/site 8000)
+
+# Everything under docs/results: hours on two cores. Interrupted, it goes on where it was; runs/ keeps the records.
+# `make results EPISODES=1` is a rehearsal. Solves are timed one at a time.
+SUITES ?= paper-table1 paper-case-study paper-fig7 matching-synthetic scaling-robots paper-runtime
+WORKERS ?= 2
+results: $(STAMP)
+	for suite in $(SUITES); do \
+	  workers=$(WORKERS); [ $$suite != paper-runtime ] || workers=1; \
+	  mkdir -p docs/results/$$suite && \
+	  $(BIN)/covis benchmark $$suite --out runs/$$suite --resume --workers $$workers $(if $(EPISODES),--episodes $(EPISODES)) \
+	    --json docs/results/$$suite/rows.json --figure docs/results/$$suite/figure.png && \
+	  $(BIN)/covis report runs/$$suite && \
+	  cp runs/$$suite/report.md runs/$$suite/report.html docs/results/$$suite/ || exit 1; \
+	done
 
 clean:
 	rm -rf $(VENV) .venv-rllib .venv-torchvision build *.egg-info covis-demo

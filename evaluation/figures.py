@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from .methods import EVALUATION_ONLY
+from .report import paper
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -61,6 +65,64 @@ def sensitivity_figure(rows: Sequence[Row]) -> Figure:
         axis.set_ylabel(r"$\lambda_1$ (uncertainty)")
         axis.set_title(f"{target}: F1 of rgm", fontsize=10)
     return figure
+
+
+def benchmark_figure(rows: Sequence[Row]) -> Figure:
+    """Rows of `covis benchmark`: robustness where methods were disturbed, else F1 of every method on every target.
+
+    Raises:
+        ValueError: no rows.
+    """
+    if not rows:
+        raise ValueError("there are no rows to draw")
+    return robustness_figure(rows) if any(row["disturbance"] for row in rows) else f1_figure(rows)
+
+
+def f1_figure(rows: Sequence[Row]) -> Figure:
+    """F1 with its 95 % interval, a panel per experiment, best first; a diamond is the paper's value."""
+    groups = list(dict.fromkeys(row["experiment"] for row in rows))
+    figure, axes = _figure(len(groups), 3.6, 1.2 + 0.24 * max(Counter(r["experiment"] for r in rows).values()))
+    for axis, group in zip(axes, groups, strict=True):
+        own = sorted((row for row in rows if row["experiment"] == group), key=lambda row: row["f1"])
+        for y, row in enumerate(own):
+            color = OURS if row["method"] == "bayes" else "0.6" if row["method"] in EVALUATION_ONLY else "0.2"
+            axis.plot([row["f1_low"], row["f1_high"]], [y, y], color=color, linewidth=1.4)
+            axis.plot(row["f1"], y, "o", color=color, markersize=5)
+            published = None if row["options"] else paper.published(row["target"], row["method"])
+            if published is not None:
+                axis.plot(paper.f1(published), y, "D", markersize=5, markerfacecolor="none", markeredgecolor="#d55e00")
+        axis.set_yticks(range(len(own)), [_label(row) for row in own], fontsize=8)
+        axis.set_xlim(0, 1.02)
+        axis.set_xlabel("F1")
+        axis.set_title(group, fontsize=10)
+    return figure
+
+
+def robustness_figure(rows: Sequence[Row]) -> Figure:
+    """The paper's Fig. 7: precision (solid) and recall (dashed) against the rate, a panel per kind of disturbance."""
+    kinds = list(dict.fromkeys(kind for row in rows for kind in row["disturbance"]))
+    plain = [row for row in rows if not row["disturbance"] and row["method"] not in EVALUATION_ONLY]
+    figure, axes = _figure(len(kinds), 3.4, 3.6)
+    for axis, kind in zip(axes, kinds, strict=True):
+        for k, base in enumerate(plain):
+            own = [row for row in rows if _label(row) == _label(base) and set(row["disturbance"]) <= {kind}]
+            own = [row for row in own if row["experiment"] == base["experiment"]]
+            own.sort(key=lambda row: row["disturbance"].get(kind, 0.0))
+            color = OURS if base["method"] == "bayes" else OTHERS[k % len(OTHERS)]
+            rate = [100 * row["disturbance"].get(kind, 0.0) for row in own]
+            for measure, line in (("precision", "-"), ("recall", "--")):
+                label = _label(base) if measure == "precision" else None
+                values = [row[measure] for row in own]
+                axis.plot(rate, values, line, color=color, marker=MARKERS[k % len(MARKERS)], markersize=4, label=label)
+        axis.set_xlabel(kind.replace("_", " ") + ", % more")
+        axis.set_ylim(0, 1)
+    axes[0].set_ylabel("precision (solid), recall (dashed)")
+    axes[0].legend(fontsize=8, frameon=False)
+    return figure
+
+
+def _label(row: Row) -> str:
+    return ":".join([row["method"], *(f"{key}={value}" for key, value in row["options"].items())])
 
 
 def scaling_figure(rows: Sequence[Row]) -> Figure:

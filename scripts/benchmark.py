@@ -13,6 +13,7 @@ from rich.table import Table
 
 from ..evaluation.benchmark import benchmark as run_benchmark
 from ..evaluation.benchmark import benchmark_suite
+from ..evaluation.extras import require
 from ..evaluation.methods import Method
 from ..evaluation.settings import Settings
 from ..evaluation.suites import SUITES
@@ -35,7 +36,9 @@ def benchmark(
         str | None, typer.Option(help="Eyes in scenes: learned (default) | learned:FOLDER | simulated.")
     ] = None,
     images: Annotated[int | None, typer.Option(help="perception: images per scene (300).")] = None,
-    figure: Annotated[Path | None, typer.Option(help="perception: picture of what the eyes see.")] = None,
+    figure: Annotated[
+        Path | None, typer.Option(help="Draw F1, or robustness; for perception, what the eyes see.")
+    ] = None,
     workers: Annotated[int, typer.Option(help="Processes; on Ray, units at a time (1: one per CPU).")] = 1,
     engine: Annotated[str, typer.Option(help="local | ray.")] = "local",
     ray_address: Annotated[str | None, typer.Option(help="A running Ray cluster: auto, or HOST:PORT.")] = None,
@@ -57,6 +60,8 @@ def benchmark(
             raise ValueError(f"{'--resume' if resume else '--overwrite'} needs --out")
         if resume and overwrite:
             raise ValueError("give --resume or --overwrite, not both")
+        if figure is not None:
+            require("viz")
         with progress_bar("benchmark") as progress:
             rows = _run(targets, method or [], _only(given), _only(changes), how | {"progress": progress})
     except (ValueError, RuntimeError, OSError) as error:
@@ -64,6 +69,10 @@ def benchmark(
     except KeyboardInterrupt:
         _interrupted(out_dir)
     write_rows(rows, json_target)
+    if figure is not None:
+        from ..evaluation.figures import benchmark_figure, save
+
+        save(benchmark_figure(rows), figure)
     if json_target != "-":
         out.print(table(rows))
 

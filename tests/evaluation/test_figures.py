@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("matplotlib")
 
-from covis.evaluation.figures import reliability_figure, save, scaling_figure, sensitivity_figure
+from covis.evaluation.figures import benchmark_figure, reliability_figure, save, scaling_figure, sensitivity_figure
 from covis.matching.metrics import reliability
 
 
@@ -42,3 +42,38 @@ def test_reliability_has_a_line_per_method():
     bins = reliability(np.linspace(0, 1, 50), np.linspace(0, 1, 50) > 0.5)
     (axis,) = reliability_figure({"bayes": bins, "rgm": bins}).axes
     assert len(axis.lines) == 3
+
+
+def row(method, f1, disturbance=None, target="multi_robot"):
+    return {
+        "experiment": target,
+        "target": target,
+        "method": method,
+        "options": {},
+        "disturbance": disturbance or {},
+        "precision": f1,
+        "recall": f1 / 2,
+        "f1": f1,
+        "f1_low": f1 - 0.1,
+        "f1_high": f1 + 0.1,
+    }
+
+
+def test_f1_figure_has_the_papers_value_beside_ours():
+    figure = benchmark_figure([row("rgm", 0.5), row("bayes", 0.8), row("oracle", 1.0)])
+    (axis,) = figure.axes
+    assert [label.get_text() for label in axis.get_yticklabels()] == ["rgm", "bayes", "oracle"]
+    published = [line for line in axis.lines if line.get_marker() == "D"]
+    assert [float(line.get_xdata()[0]) for line in published] == pytest.approx([2 * 0.701 * 0.711 / (0.701 + 0.711)])
+
+
+def test_robustness_figure_goes_from_undisturbed_to_the_highest_rate():
+    disturbed = [row("rgm", 0.5 - rate, {"position_noise": rate}) for rate in (0.2, 0.1)]
+    figure = benchmark_figure([row("rgm", 0.5), *disturbed, row("random", 0.1)])
+    (axis,) = figure.axes
+    precision, recall = axis.lines
+    np.testing.assert_allclose(precision.get_xdata(), [0, 10, 20])
+    np.testing.assert_allclose(precision.get_ydata(), [0.5, 0.4, 0.3])
+    np.testing.assert_allclose(recall.get_ydata(), [0.25, 0.2, 0.15])
+    with pytest.raises(ValueError, match="no rows"):
+        benchmark_figure([])
