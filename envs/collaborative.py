@@ -552,8 +552,8 @@ def _sums(result: StepScore) -> NDArray[np.float64]:
     localized = ~np.isnan(result.error_single)
     out = np.empty((len(localized), N_SUMS))
     out[:, :4] = team
-    out[:, 4] = np.nansum(result.error_single, axis=1)
-    out[:, 5] = np.nansum(result.error_fused, axis=1)
+    out[:, 4] = np.where(localized, result.error_single, 0.0).sum(axis=1)
+    out[:, 5] = np.where(localized, result.error_fused, 0.0).sum(axis=1)
     out[:, 6] = localized.sum(axis=1)
     return out
 

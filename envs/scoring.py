@@ -136,7 +136,8 @@ class LocalizationReward:
 def score(claims: Sequence[Claims], truth: Truth) -> StepScore:
     """Score the claims of all robots, in the order of `truth.T_world_camera`."""
     tied = np.stack([tie(claim.boxes, truth.boxes[i], truth.pixels[i]) for i, claim in enumerate(claims)])
-    pairs = tuple(_score_pair(a, b, claims, tied, truth) for a, b in combinations(range(len(claims)), 2))
+    visible = truth.visible()
+    pairs = tuple(_score_pair(a, b, claims, tied, visible) for a, b in combinations(range(len(claims)), 2))
     matched = np.zeros(tied.shape, dtype=bool)
     for pair in pairs:
         right = pair.assertions[pair.hits]
@@ -147,6 +148,8 @@ def score(claims: Sequence[Claims], truth: Truth) -> StepScore:
     object_error = np.full(len(truth.identity), np.inf)
     for i, claim in enumerate(claims):
         slots = np.flatnonzero(tied[i] >= 0)
+        if len(slots) == 0:
+            continue
         objects = tied[i, slots]
         true = truth.positions_in_camera(i)[objects]
         error = np.linalg.norm(claim.positions[slots] - true, axis=1)
@@ -157,7 +160,9 @@ def score(claims: Sequence[Claims], truth: Truth) -> StepScore:
     return StepScore(pairs, tied, single, fused, object_error)
 
 
-def _score_pair(a: int, b: int, claims: Sequence[Claims], tied: NDArray[np.int64], truth: Truth) -> PairScore:
+def _score_pair(
+    a: int, b: int, claims: Sequence[Claims], tied: NDArray[np.int64], visible: NDArray[np.bool_]
+) -> PairScore:
     # Partners are listed in ascending order without self: b is at b - 1 for a, a is at a for b.
     forward, forward_scores = claims[a].matches[b - 1], claims[a].match_scores[b - 1]
     backward, backward_scores = claims[b].matches[a], claims[b].match_scores[a]
@@ -171,13 +176,12 @@ def _score_pair(a: int, b: int, claims: Sequence[Claims], tied: NDArray[np.int64
     slots = np.array(list(asserted), dtype=np.int64).reshape(-1, 2)
     object_a, object_b = tied[a, slots[:, 0]], tied[b, slots[:, 1]]
     hits = (object_a == object_b) & (object_a >= 0)
-    common = np.intersect1d(tied[a][tied[a] >= 0], tied[b][tied[b] >= 0])
-    visible = truth.visible()
+    common = set(tied[a].tolist()) & set(tied[b].tolist()) - {-1}
     return PairScore(
         a,
         b,
-        Counts(int(hits.sum()), len(slots), len(common)),
-        int((visible[a] & visible[b]).sum()),
+        Counts(int(np.count_nonzero(hits)), len(slots), len(common)),
+        int(np.count_nonzero(visible[a] & visible[b])),
         slots,
         hits,
         np.array(list(asserted.values())),

@@ -37,8 +37,8 @@ class PoseNoise:
     def covariance(self, up: Array) -> Array:
         """Covariance (6, 6) of the reported pose, right perturbation; `up` (3,) in the camera frame."""
         out = np.zeros((6, 6))
-        out[:3, :3] = self.position_m**2 * np.eye(3)
-        out[3:, 3:] = self.heading_rad**2 * np.outer(up, up)
+        out[0, 0] = out[1, 1] = out[2, 2] = self.position_m**2
+        out[3:, 3:] = self.heading_rad**2 * (up[:, None] * up)
         return out
 
     def pose(self, T_world_camera: Array, rng: np.random.Generator) -> Array:

@@ -37,6 +37,11 @@ def peak_mib(method: str, n: int) -> float:
     return max(0, _kib("VmHWM") - before) / 1024
 
 
+def resident_mib() -> float:
+    """MiB that this process holds in memory now."""
+    return _kib("VmRSS") / 1024
+
+
 def _kib(field: str) -> int:
     found = re.search(rf"^{field}:\s+(\d+) kB", STATUS.read_text(), re.MULTILINE)
     assert found is not None

@@ -8,6 +8,7 @@ is thus expressed in frame b.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 ROTATION_TOLERANCE = 1e-3
+
+# Copies of these take a fifth of the time of np.eye.
+_EYE3, _EYE4 = np.eye(3), np.eye(4)
 
 
 def skew(v: Array) -> Array:
@@ -24,16 +28,17 @@ def skew(v: Array) -> Array:
 
 def rotation_from_vector(w: Array) -> Array:
     """Rotation (3, 3) about the axis w by the angle |w| in radians (Rodrigues)."""
-    angle = float(np.linalg.norm(w))
-    K = skew(np.asarray(w, dtype=np.float64))
+    w = np.asarray(w, dtype=np.float64)
+    angle = sqrt(w.dot(w))
+    K = skew(w)
     if angle < 1e-8:
-        return np.eye(3) + K + 0.5 * K @ K
-    return np.eye(3) + np.sin(angle) / angle * K + (1.0 - np.cos(angle)) / angle**2 * K @ K
+        return _EYE3 + K + 0.5 * K @ K
+    return _EYE3 + np.sin(angle) / angle * K + (1.0 - np.cos(angle)) / angle**2 * K @ K
 
 
 def exp_se3(xi: Array) -> Array:
     """Pose (4, 4) of xi (6,) = [translation m, rotation rad], the translation taken as it is (first order)."""
-    T = np.eye(4)
+    T = _EYE4.copy()
     T[:3, :3] = rotation_from_vector(xi[3:])
     T[:3, 3] = xi[:3]
     return T
@@ -41,7 +46,7 @@ def exp_se3(xi: Array) -> Array:
 
 def invert(T_a_b: Array) -> Array:
     """T_b_a (4, 4)."""
-    T = np.eye(4)
+    T = _EYE4.copy()
     T[:3, :3] = T_a_b[:3, :3].T
     T[:3, 3] = -T_a_b[:3, :3].T @ T_a_b[:3, 3]
     return T
@@ -70,7 +75,7 @@ def check_pose(T: Array, name: str) -> Array:
     if not np.isfinite(T).all():
         raise ValueError(f"{name} must be finite, got\n{T}")
     R = T[:3, :3]
-    error = float(np.abs(R @ R.T - np.eye(3)).max())
+    error = float(np.abs(R @ R.T - _EYE3).max())
     if error > ROTATION_TOLERANCE or np.linalg.det(R) < 0 or not np.allclose(T[3], (0, 0, 0, 1)):
         raise ValueError(f"{name} is not a rigid motion: |R R^T - I| = {error:.2g}, det R = {np.linalg.det(R):.3g}")
     return T

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
@@ -27,8 +28,15 @@ def speed(
     area: Annotated[str, typer.Argument(help=f"{' | '.join(AREAS)}.")],
     json_target: Annotated[str | None, typer.Option("--json", help="Write rows to FILE; - prints them.")] = None,
     figure: Annotated[Path | None, typer.Option(help="matching: figure of time and memory against size.")] = None,
+    memory: Annotated[
+        bool, typer.Option("--memory", help="envs: growth over resets and steps instead, a process per scene.")
+    ] = False,
+    resets: Annotated[int, typer.Option(help="--memory: resets of each scene.")] = 1_000,
+    steps: Annotated[int, typer.Option(help="--memory: steps of each scene.")] = 100_000,
 ) -> None:
     """Rates per second against peers, side by side in this process, on one thread."""
+    if memory and area != "envs":
+        fail(f"--memory is for envs, not for {area}")
     if figure is not None and area != "matching":
         fail(f"--figure is for matching, not for {area}")
     if area not in AREAS:
@@ -40,7 +48,10 @@ def speed(
     try:
         if extra is not None:
             require(extra)
-        measure = import_module(f"covis.evaluation.{module}").rows
+        if memory:
+            measure = partial(import_module("covis.evaluation.memory_envs").rows, resets=resets, steps=steps)
+        else:
+            measure = import_module(f"covis.evaluation.{module}").rows
         if figure is not None:
             require("viz")
         with progress_bar(f"speed {area}") as progress:
@@ -63,9 +74,13 @@ def table(rows: list[dict[str, Any]]) -> Table:
         view.add_row(
             r["what"],
             "" if r["n"] is None else str(r["n"]),
-            f"{r['ours']:.4g}/s",
-            "" if r["peer_value"] is None else f"{r['peer_value']:.4g}/s",
-            "" if r["ratio"] is None else f"{r['ratio']:.1f}x",
+            _quantity(r["ours"], r["unit"]),
+            "" if r["peer_value"] is None else _quantity(r["peer_value"], r["unit"]),
+            "" if r["ratio"] is None else f"{r['ratio']:.1f}x" if r["unit"] == "1/s" else f"{r['ratio'] - 1:+.2%}",
             r["peer"] or "",
         )
     return view
+
+
+def _quantity(value: float, unit: str) -> str:
+    return f"{value:.4g}/s" if unit == "1/s" else f"{value:.1f} {unit}"

@@ -34,6 +34,34 @@ def test_a_quadratic_affinity_shows_in_memory():
     assert rrwm["memory_mib"] > reid["memory_mib"] + 5
 
 
+@pytest.mark.skipif(not STATUS.exists(), reason="the operating system does not tell a process's memory")
+def test_memory_of_an_environment_counts_its_steps_and_files():
+    pytest.importorskip("pybullet")
+    from covis.evaluation.memory_envs import growth
+
+    grown = growth("target_localization", resets=3, steps=10)
+    assert grown.steps >= 10
+    assert grown.last_files == grown.first_files
+    assert 0.9 < grown.last_mib / grown.first_mib < 1.1
+
+
+def test_memory_refuses_nothing_to_do():
+    from covis.evaluation import memory_envs
+
+    with pytest.raises(ValueError, match="resets must be at least 1, got 0"):
+        memory_envs.rows(resets=0)
+
+
+def test_memory_is_for_environments():
+    from typer.testing import CliRunner
+
+    from covis.scripts.main import app
+
+    result = CliRunner().invoke(app, ["speed", "matching", "--memory"])
+    assert result.exit_code == 2
+    assert "--memory is for envs" in result.stderr
+
+
 def test_speed_refuses_unknown_areas():
     from typer.testing import CliRunner
 
