@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
 from .camera.effects import EffectRanges
+from .camera.mount import Mount, checked_mounts, kept_picture, with_mounts
 from .camera.raster import Frame as CameraFrame
 from .camera.raster import Look, intrinsics_from_fov
 from .camera.rig import CameraRig, Exposures
@@ -106,13 +107,15 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         messages: add the partners' claims of the last step to the observation.
         backend: "raster" (our camera), "tiny" or "egl" (pybullet's renderers).
         look: shading, shadows and so on of our camera; None = all of it.
+        mounts: one `Mount` per robot: where its camera sits, how wide it looks, how often it takes a picture; None
+            instead of all or of one keeps the scene's.
         effects: ranges of exposure, noise, blur, lens and so on, from which every episode draws each camera's; None =
             ideal cameras. A lens that distorts bends all images alike; `intrinsics` stay those of the pinhole.
         seed: of the first reset that brings none; later ones go on from it. None draws one.
         render_mode: `rgb_array`, `human` or None.
 
     Raises:
-        ValueError: a size, sensor or mode that does not exist; a world with a single robot.
+        ValueError: a size, sensor or mode that does not exist; a world with a single robot; mounts for other robots.
     """
 
     def __init__(
@@ -131,6 +134,7 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         messages: bool = False,
         backend: str = "raster",
         look: Look | None = None,
+        mounts: Sequence[Mount | None] | None = None,
         effects: EffectRanges | None = None,
         seed: Seed | None = None,
         render_mode: Literal["rgb_array", "human"] | None = None,
@@ -150,6 +154,7 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
             messages=messages,
             backend=backend,
             look=look,
+            mounts=mounts,
             effects=effects,
             seed=seed,
             render_mode=render_mode,
@@ -193,9 +198,12 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         self.possible_agents = [f"robot_{i}" for i in range(n)]
         self.agents: list[str] = []
         self.classes = tuple(c.name for c in self.world.classes)
-        self.intrinsics = np.stack(
-            [intrinsics_from_fov(self.width, self.height, float(f)) for f in self.world.horizontal_fov_rad]
-        )
+        self.mounts = checked_mounts(mounts, n)
+        views = [
+            float(fov if mount is None else mount.horizontal_fov_rad)
+            for mount, fov in zip(self.mounts, self.world.horizontal_fov_rad, strict=True)
+        ]
+        self.intrinsics = np.stack([intrinsics_from_fov(self.width, self.height, fov) for fov in views])
         self._seeds = EpisodeSeeds.start(seed)
         self._rig = CameraRig(
             self.world.meshes, self.width, self.height, self.intrinsics, backend=backend, look=look, effects=effects
@@ -324,7 +332,7 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         self.world.step(np.stack([control for control, _ in decoded]))
         episode.steps += 1
         snapshot = self._take_snapshot()
-        episode.before, episode.now = episode.now, self._look(snapshot, episode.exposures)
+        episode.before, episode.now = episode.now, self._look(snapshot, episode.exposures, episode.steps, episode.now)
         episode.trail.append(snapshot.T_world_camera[:, :2, 3].copy())
         crashed = bool(self.world.ends_on_collision and snapshot.collided.any())
         over = episode.steps >= self.max_cycles
@@ -378,17 +386,17 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         return self._episode
 
     def _take_snapshot(self) -> Snapshot:
-        snapshot = self.world.snapshot()
+        snapshot = with_mounts(self.world.snapshot(), self.mounts)
         if len(snapshot.identity) > self.world.max_objects:
             raise RuntimeError(
                 f"{self.name}: {len(snapshot.identity)} objects, max_objects is {self.world.max_objects}"
             )
         return snapshot
 
-    def _look(self, snapshot: Snapshot, exposures: Exposures) -> Instant:
-        """Render an instant and note what is true."""
+    def _look(self, snapshot: Snapshot, exposures: Exposures, step: int = 0, before: Instant | None = None) -> Instant:
+        """Render an instant and note what is true; a camera that is not due keeps its picture of the instant before."""
         m = len(snapshot.identity)
-        frames = self._rig.shoot(snapshot, exposures)
+        frames = self._shoot(snapshot, exposures, step, before)
         tight = [tight_boxes(frame.instances, m) for frame in frames]
         truth = Truth(
             identity=snapshot.identity,
@@ -400,6 +408,18 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
             min_pixels=self.min_pixels,
         )
         return Instant(snapshot, frames, truth)
+
+    def _shoot(
+        self, snapshot: Snapshot, exposures: Exposures, step: int, before: Instant | None
+    ) -> tuple[CameraFrame, ...]:
+        seconds = self.world.step_seconds
+        due = [i for i, m in enumerate(self.mounts) if before is None or m is None or m.is_due(step, seconds)]
+        if before is None or len(due) == len(self.mounts):
+            return self._rig.shoot(snapshot, exposures)
+        frames = [kept_picture(frame, before.snapshot, snapshot) for frame in before.frames]
+        for i, frame in zip(due, self._rig.shoot(snapshot, exposures, due), strict=True):
+            frames[i] = frame
+        return tuple(frames)
 
     def _observe(self, episode: _Episode) -> dict[str, Any]:
         episode.mark()

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..worlds.world import Array
+from ..worlds.world import Array, Snapshot
+from .raster import Frame
 
 
 @dataclass(frozen=True)
@@ -61,3 +63,45 @@ class Mount:
             return True
         now, before = (int(np.floor(n * step_seconds * self.rate_hz + 1e-9)) for n in (step, step - 1))
         return now > before
+
+
+def checked_mounts(mounts: Sequence[Mount | None] | None, n_robots: int) -> tuple[Mount | None, ...]:
+    """One mount per robot; None keeps the camera that the scene gives it.
+
+    Raises:
+        ValueError: another number of mounts than robots.
+        TypeError: something that is not a mount.
+    """
+    if mounts is None:
+        return (None,) * n_robots
+    if len(mounts) != n_robots:
+        raise ValueError(f"mounts must hold one Mount or None per robot, {n_robots} of them, got {len(mounts)}")
+    for i, mount in enumerate(mounts):
+        if mount is not None and not isinstance(mount, Mount):
+            raise TypeError(f"mounts[{i}] must be a Mount or None, got {type(mount).__name__}")
+    return tuple(mounts)
+
+
+def with_mounts(snapshot: Snapshot, mounts: Sequence[Mount | None]) -> Snapshot:
+    """The snapshot with cameras where the mounts put them.
+
+    Raises:
+        ValueError: a mount for a robot without a body.
+    """
+    if not any(mounts):
+        return snapshot
+    cameras = snapshot.T_world_camera.copy()
+    for i, mount in enumerate(mounts):
+        if mount is not None:
+            own = np.flatnonzero(snapshot.body_object == snapshot.robot_object[i])
+            if snapshot.robot_object[i] < 0 or len(own) == 0:
+                raise ValueError(f"mounts[{i}]: robot {i} has no body in this world to mount a camera on")
+            cameras[i] = mount.T_world_camera(snapshot.body_poses[own[0]])
+    return replace(snapshot, T_world_camera=cameras)
+
+
+def kept_picture(frame: Frame, taken: Snapshot, now: Snapshot) -> Frame:
+    """An old picture with the object indices of the present snapshot; objects that are gone become background."""
+    index = {identity: j for j, identity in enumerate(now.identity.tolist())}
+    lookup = np.array([-1, *(index.get(identity, -1) for identity in taken.identity.tolist())], dtype=np.int32)
+    return Frame(frame.rgb, frame.depth, lookup[frame.instances + 1])

@@ -67,18 +67,19 @@ class CameraRig:
             return Exposures((), rng)
         return Exposures(tuple(self._ranges.sample(rng) for _ in self.intrinsics), rng)
 
-    def shoot(self, snapshot: Snapshot, exposures: Exposures) -> tuple[Frame, ...]:
-        """A fresh frame of every robot's camera."""
+    def shoot(self, snapshot: Snapshot, exposures: Exposures, robots: Sequence[int] | None = None) -> tuple[Frame, ...]:
+        """A fresh frame of every robot's camera, or of those of `robots`."""
         camera = self._renderer()
+        robots = range(len(self.intrinsics)) if robots is None else robots
         if not exposures.effects:
-            return tuple(camera.render(snapshot, i, K) for i, K in enumerate(self.intrinsics))
+            return tuple(camera.render(snapshot, i, self.intrinsics[i]) for i in robots)
         assert isinstance(camera, Rasterizer)
         if self._sensors_of != exposures.effects:
             self._sensors_of = exposures.effects
             self._sensors = [
                 SensorCamera(camera, K, effects) for K, effects in zip(self.intrinsics, exposures.effects, strict=True)
             ]
-        return tuple(sensor.render(snapshot, i, exposures.rng) for i, sensor in enumerate(self._sensors))
+        return tuple(self._sensors[i].render(snapshot, i, exposures.rng) for i in robots)
 
     def close(self) -> None:
         """Release a pybullet backend; calling it twice is harmless."""

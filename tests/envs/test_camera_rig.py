@@ -1,10 +1,13 @@
 """The cameras of an environment: backends, looks, and effects that belong to the episode."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from box_world import BoxWorld
 
 from covis.envs.camera.effects import EffectRanges
+from covis.envs.camera.mount import Mount
 from covis.envs.camera.raster import PLAIN
 from covis.envs.collaborative import CollaborativeEnv
 from covis.envs.scenes import parallel_env
@@ -83,3 +86,57 @@ def test_tiny_renderer_sees_the_same_objects():
 def test_impossible_cameras_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         boxes(**options)
+
+
+def test_a_mount_moves_a_camera_and_widens_its_view():
+    mount = Mount(forward_m=0.2, height_m=2.0, tilt_rad=0.3, horizontal_fov_rad=1.6)
+    plain, moved = (
+        parallel_env("multi_robot", preset="easy", width=64, height=48, mounts=mounts)
+        for mounts in (None, (None, mount))
+    )
+    plain.reset(seed=0)
+    moved.reset(seed=0)
+    before, after = plain.snapshot(), moved.snapshot()
+    np.testing.assert_array_equal(after.T_world_camera[0], before.T_world_camera[0])
+    np.testing.assert_array_equal(plain.camera_frames()[0].rgb, moved.camera_frames()[0].rgb)
+    assert after.T_world_camera[1, 2, 3] == pytest.approx(2.0)
+    assert moved.intrinsics[1, 0, 0] == pytest.approx(32 / np.tan(0.8))
+    np.testing.assert_allclose(after.T_world_camera[1], mount.T_world_camera(before.body_poses[1]))
+
+
+def test_a_slow_camera_keeps_its_picture_and_the_truth_goes_with_it():
+    env = parallel_env("connected_driving", width=96, height=72, mounts=(Mount(height_m=1.6, rate_hz=2.5), None))
+    env.reset(seed=2)
+    actions = {a: env.action_space(a).sample() | {"control": np.zeros(2, np.float32)} for a in env.agents}
+    pictures, names = [], []
+    for _ in range(5):
+        observations = env.step(actions)[0]
+        pictures.append(observations["robot_0"]["image"])
+        truth, frame = env.ground_truth(), env.camera_frames()[0]
+        names.append({int(i) for i in truth.identity[truth.pixels[0] > 0]})
+        assert [(frame.instances == j).sum() for j in range(len(truth.identity))] == truth.pixels[0].tolist()
+    same = [bool((a == b).all()) for a, b in pairwise(pictures)]
+    assert same == [False, True, False, True]  # steps 1..5 of 0.2 s, a picture every 0.4 s
+    assert names[2] <= names[1]
+    saved = env.save_state()
+    first = env.step(actions)[0]["robot_0"]["image"]
+    env.restore_state(saved)
+    np.testing.assert_array_equal(env.step(actions)[0]["robot_0"]["image"], first)
+
+
+@pytest.mark.parametrize(
+    ("mounts", "error", "message"),
+    [
+        ((None,), ValueError, "one Mount or None per robot, 2 of them, got 1"),
+        ((None, 1.0), TypeError, r"mounts\[1\] must be a Mount"),
+    ],
+)
+def test_mounts_must_fit_the_robots(mounts, error, message):
+    with pytest.raises(error, match=message):
+        boxes(mounts=mounts)
+
+
+def test_a_robot_without_a_body_carries_no_mount():
+    env = boxes(mounts=(Mount(), None))
+    with pytest.raises(ValueError, match="robot 0 has no body"):
+        env.reset(seed=0)
