@@ -160,7 +160,7 @@ def _labels(series: Sequence[Series], to_x: Callable[[float], float], to_y: Call
     out: list[Element] = []
     for s in sorted((s for s in series if s.points), key=lambda s: at[s.name][1]):
         u, v = at[s.name]
-        anchor, x, y, box = _free_place(u, v, 6.4 * len(s.name), [b for b in taken if not _inside(u, v, b)])
+        anchor, x, y, box = _free_place(u, v, 7.2 * len(s.name), [b for b in taken if not _inside(u, v, b)])
         taken.append(box)
         parts = [h("text", {"class": "tag", "x": x, "y": y + 4, "text-anchor": anchor}, s.name)]
         if abs(y - v) > 8:

@@ -200,14 +200,14 @@ class Track:
     errors: tuple[float, float]
 
 
-def best_tracks(group: Group, method: str) -> tuple[list[Page], list[Track]]:
-    """The kept episode in which a method followed moving objects longest, and these."""
-    found = [(pages, tracks(pages, method)) for pages in episodes(group)]
+def best_tracks(group: Group, method: str, least_m: float = MIN_PATH_M) -> tuple[list[Page], list[Track]]:
+    """The kept episode in which a method followed objects longest that move at least so far, and these objects."""
+    found = [(pages, tracks(pages, method, least_m)) for pages in episodes(group)]
     return max(found, key=lambda x: sum(len(t.single) for t in x[1]), default=([], []))
 
 
-def tracks(pages: Sequence[Page], method: str) -> list[Track]:
-    """The moving objects that a method matched rightly most often, each by the observer that saw it most."""
+def tracks(pages: Sequence[Page], method: str, least_m: float) -> list[Track]:
+    """The objects that a method matched rightly most often, each by the observer that saw it most; far movers first."""
     truth: dict[int, list[list[float]]] = {}
     found: dict[tuple[int, str], list[list[list[float]]]] = {}
     for page in pages:
@@ -219,8 +219,8 @@ def tracks(pages: Sequence[Page], method: str) -> list[Track]:
     for (identity, observer), frames in found.items():
         if identity not in longest or len(frames) > len(found[identity, longest[identity]]):
             longest[identity] = observer
-    moving = [i for i in longest if _length(truth[i]) >= MIN_PATH_M and len(found[i, longest[i]]) >= MIN_FRAMES]
-    moving.sort(key=lambda i: -_length(truth[i]) * len(found[i, longest[i]]))
+    moving = [i for i in longest if _length(truth[i]) >= least_m and len(found[i, longest[i]]) >= MIN_FRAMES]
+    moving.sort(key=lambda i: -(_length(truth[i]) + 1e-3) * len(found[i, longest[i]]))
     return [_track(i, longest[i], truth[i], np.array(found[i, longest[i]])) for i in moving[:MAX_TRACKS]]
 
 
@@ -260,17 +260,32 @@ def _localised(page: Page, method: str) -> list[tuple[int, str, list[float], lis
     return out
 
 
+def _true_path(points: Sequence[tuple[float, float]]) -> Element:
+    """A line, or a ring where nothing moves."""
+    (u0, v0), (u1, v1) = np.min(points, axis=0), np.max(points, axis=0)
+    if max(u1 - u0, v1 - v0) < 4:
+        return h("circle", {"class": "truth", "cx": (u0 + u1) / 2, "cy": (v0 + v1) / 2, "r": 4})
+    return h("path", {"class": "truth", "d": path(points)})
+
+
+def _tag(at: tuple[float, float], name: str) -> Element:
+    """A name beside a place, on the side where there is room."""
+    u, v = at
+    left = u > WIDTH * 0.75
+    attributes: dict[str, object] = {"class": "tag", "x": u - 5 if left else u + 5, "y": max(v - 5, 12.0)}
+    return h("text", attributes | {"text-anchor": "end" if left else "start"}, name)
+
+
 def trajectories(name: str, found: Sequence[Track], which: str) -> Element:
     """True paths of the tracks, and the estimates of one robot (`single`) or of both (`fused`)."""
     view = view_of(np.concatenate([p for t in found for p in (t.truth, t.single, t.fused)]))
     parts: list[Child] = []
     for track in found:
         estimates = track.single if which == "single" else track.fused
-        parts.append(h("path", {"class": "truth", "d": path([view(p) for p in track.truth])}))
+        parts.append(_true_path([view(p) for p in track.truth]))
         parts.append(h("path", {"class": f"estimate {which}", "d": path([view(p) for p in estimates])}))
         at = [view(p) for p in estimates]
         parts.append([h("circle", {"class": f"point {which}", "cx": u, "cy": v, "r": 2.2}) for u, v in at])
-        u, v = view(track.truth[0])
-        parts.append(h("text", {"class": "tag", "x": u + 5, "y": v - 5}, f"object {track.identity}"))
+        parts.append(_tag(view(track.truth[0]), f"object {track.identity}"))
     what = "one robot alone" if which == "single" else "fused"
     return _map(f"Trajectories from above on {name}: truth and {what}", [parts, scale_bar(view)])

@@ -47,21 +47,24 @@ def figure_10(groups: Sequence[Group]) -> Element | None:
         return None
     single, fused = (1000 * error for error in CASE_STUDY_ERROR_M)
     note = (
-        f"Up to {topview.MAX_TRACKS} moving objects of an episode, in the frames in which the best method matched them "
-        "rightly (the oracle, where the best method followed nothing that moves): as one observer estimates them "
-        "alone, and fused with the other. Black: truth. Shown is the kept episode in which objects are followed "
-        f"longest. The paper’s Fig. 10; its case study reports {single:.1f} mm alone and {fused:.1f} mm fused."
+        f"Up to {topview.MAX_TRACKS} moving objects of an episode (objects that stand still, where none that moves was "
+        "followed), in the frames in which the best method matched them rightly (the oracle, where it followed none): "
+        "as one observer estimates them alone, and fused with the other. Thick line or ring: truth. Shown is the kept "
+        "episode in which objects are followed longest. The paper’s Fig. 10; its case study reports "
+        f"{single:.1f} mm alone and {fused:.1f} mm fused."
     )
     return section("trajectories", "Trajectories: truth, one robot, fused", note, panels)
 
 
 def _tracks(group: Group) -> list[Element]:
-    """One panel alone, one fused: by the best method that followed something, the oracle where there is no other."""
-    by_quality = sorted(group.competitors, key=lambda e: -e.f1) + [e for e in group.entries if e.label == "oracle"]
-    for entry in by_quality[:1] + [e for e in by_quality if e.label == "oracle"]:
-        pages, found = topview.best_tracks(group, entry.label)
-        if found:
-            return [_panel(group, entry, pages[0], found, which) for which in ("single", "fused")]
+    """One panel alone, one fused: by the best method if it followed something that moves, else by the oracle, else of
+    what stands still."""
+    entries = [group.best, *(e for e in group.entries if e.label == "oracle")]
+    for least_m in (topview.MIN_PATH_M, 0.0):
+        for entry in entries:
+            pages, found = topview.best_tracks(group, entry.label, least_m)
+            if found:
+                return [_panel(group, entry, pages[0], found, which) for which in ("single", "fused")]
     return []
 
 

@@ -251,6 +251,8 @@ def test_tracks_follow_what_moves(run_folder):
     assert track.identity == 1
     assert len(track.truth) == len(track.single) == 5
     assert track.errors == pytest.approx((0.1, 0.05), abs=1e-6)
+    _, still = best_tracks(group, METHODS[0], least_m=0.0)
+    assert [track.identity for track in still] == [1, 2]  # the third was never matched rightly
 
 
 def test_episodes_of_different_seeds_are_not_mixed(run_folder):
