@@ -166,10 +166,8 @@ def _model(params: PolicyParams, vector: Any, checkpoint: Path) -> Any:
         vector,
         n_steps=n_steps,
         batch_size=n_steps * vector.num_envs // 4,
-        learning_rate=1e-3,
         gamma=0.95,
-        # Episodes are few, and in most scenes restless robots see less: begin with small movements.
-        policy_kwargs={"log_std_init": -1.0},
+        policy_kwargs={"log_std_init": -0.5},
         device="cpu",
     )
 
