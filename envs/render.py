@@ -90,8 +90,8 @@ def _head(name: str, time: float, answered: Answered | None, width: int) -> Imag
     parts.append(("of", f"{score.n_visible} covisible", INK))
     single, fused = score.error_single, score.error_fused
     if np.isfinite(fused).any():
-        parts.append(("alone", f"{np.nanmean(single):.2f} m", INK))
-        parts.append(("fused", f"{np.nanmean(fused):.2f} m", INK))
+        parts.append(("alone", _length(float(np.nanmean(single))), INK))
+        parts.append(("fused", _length(float(np.nanmean(fused))), INK))
     u = width - sum(text_width(words, 15) + text_width(value, 17, True) + 24 for words, value, _ in parts)
     for words, value, color in parts:
         u += text(picture, words, (u, 29), 15, FAINT) + 6
@@ -246,6 +246,10 @@ def draw_correspondences(images: Sequence[Image], claims: Sequence[Claims], resu
     words = f"{counts.correct} right of {counts.retrieved} matched, {counts.common} objects detected by both"
     text(head, words, (u + 14, 25), 15, FAINT)
     return _framed(np.concatenate([head, picture]))
+
+
+def _length(metres: float) -> str:
+    return f"{1000 * metres:.0f} mm" if metres < 0.0995 else f"{metres:.2f} m"
 
 
 class Window:

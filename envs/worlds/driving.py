@@ -65,9 +65,11 @@ class ConnectedDrivingWorld:
     """
 
     def __init__(self, n_robots: int = 2, params: DrivingParams | None = None) -> None:
-        """Raises ValueError for a number of connected vehicles that no map takes."""
-        if not 2 <= n_robots <= 6:
-            raise ValueError(f"n_robots must be between 2 and 6, got {n_robots}")
+        """Raises ValueError for a number of connected vehicles that no map takes, TypeError for others' parameters."""
+        if not isinstance(n_robots, (int, np.integer)) or not 2 <= n_robots <= 6:
+            raise ValueError(f"n_robots must be a whole number between 2 and 6, got {n_robots!r}")
+        if params is not None and not isinstance(params, DrivingParams):
+            raise TypeError(f"params must be DrivingParams, got {type(params).__name__}")
         self.params = params or DrivingParams()
         self.n_robots = n_robots
         self.map: RoadMap = road_map(self.params.map)

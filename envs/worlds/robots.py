@@ -200,7 +200,9 @@ class RobotWorld:
     """Observers that fly: the first ones."""
 
     def __init__(self, n_observers: int, params: RobotSceneParams) -> None:
-        """Raises ValueError for a number of observers that does not fit."""
+        """Raises ValueError for a number of observers that does not fit, TypeError for parameters of something else."""
+        if not isinstance(params, RobotSceneParams):
+            raise TypeError(f"params must be those of a robot scene, got {type(params).__name__}")
         self.params = params
         self.n_robots = _checked_observers(n_observers, params)
         self.models: tuple[Model, ...] = models(

@@ -221,3 +221,20 @@ class TestPaint:
         assert paint.text(stroke, "covis", (5, 25), 18) > 20
         assert (stroke != paint.CANVAS).any()
         assert paint.text_width("covis") > 10
+
+
+def test_human_mode_shows_each_step_in_a_window(monkeypatch):
+    """Without a screen, in SDL's dummy one."""
+    pygame = pytest.importorskip("pygame")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    env, still = (parallel_env("multi_robot", render_mode=mode, **SMALL) for mode in ("human", "rgb_array"))
+    actions = {a: env.action_space(a).sample() for a in env.possible_agents}
+    for one in (env, still):
+        one.reset(seed=0)
+        one.step(actions)
+    assert env.render() is None
+    shown = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
+    np.testing.assert_array_equal(shown, still.render())
+    env.close()
+    assert not pygame.display.get_init()
+    env.close()

@@ -48,3 +48,16 @@ def test_every_scene_is_in_the_registry():
     if env is not None:
         assert env.unwrapped.name == "multi_robot_v0"
         env.close()
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_parameters_of_something_else_are_refused(scene):
+    with pytest.raises(TypeError, match="got dict"):
+        parallel_env(scene, params={"n_team": 3})
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("n_robots", [1, 9, 2.5])
+def test_a_number_of_robots_that_does_not_fit_is_named(scene, n_robots):
+    with pytest.raises(ValueError, match=f"got {n_robots}"):
+        parallel_env(scene, n_robots=n_robots)
