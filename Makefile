@@ -53,9 +53,9 @@ results: $(STAMP)
 	  workers=$(WORKERS); [ $$suite != paper-runtime ] || workers=1; \
 	  mkdir -p docs/results/$$suite && \
 	  $(BIN)/covis benchmark $$suite --out runs/$$suite --resume --workers $$workers $(if $(EPISODES),--episodes $(EPISODES)) \
-	    --json docs/results/$$suite/rows.json --figure docs/results/$$suite/figure.png && \
+	    --figure docs/results/$$suite/figure.png && \
 	  $(BIN)/covis report runs/$$suite && \
-	  cp runs/$$suite/report.md runs/$$suite/report.html docs/results/$$suite/ || exit 1; \
+	  cp runs/$$suite/rows.json runs/$$suite/report.md runs/$$suite/report.html docs/results/$$suite/ || exit 1; \
 	done
 
 clean:

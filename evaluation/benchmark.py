@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from .comparison import Entry, compared
+from .comparison import Entry, Ordering, compared, judged
 from .engine import Results, make_executor, run
 from .experiments import Experiment, target_name, units_of
 from .extras import require_scene
@@ -74,13 +74,15 @@ def benchmark_suite(
         if experiment.kind == "scene":
             require_scene(experiment.settings.perception)
     about = {"suite": suite.id, "suite_version": suite.version}
-    return run_experiments(experiments, about=about, **how)
+    return run_experiments(experiments, about=about, orderings=suite.orderings, **how)
 
 
 def run_experiments(
     experiments: Sequence[Experiment],
     *,
     about: Mapping[str, Any] | None = None,
+    orderings: Sequence[Ordering] = (),
+    judge: Callable[[list[dict[str, Any]]], object] = lambda verdicts: None,
     workers: int = 1,
     engine: str = "local",
     ray_address: str | None = None,
@@ -94,6 +96,8 @@ def run_experiments(
     Args:
         experiments: what to run.
         about: put at the head of every row, and into run.json.
+        orderings: held against every experiment; the verdicts go to `judge`, and into rows.json.
+        judge: called once with them: `experiment` and what `covis.evaluation.comparison.judged` returns.
         workers, engine, ray_address: see `covis.evaluation.engine.make_executor`.
         out: folder that keeps records, run.json and rows.json.
         resume: go on with the run in `out`.
@@ -120,13 +124,19 @@ def run_experiments(
         shards.open(request, session, resume=resume, overwrite=overwrite)
     noted = {"commit": session["commit"]}
     results = run(units, executor, shards=shards, shared_folder=engine == "local", about=noted, progress=progress)
-    rows = [{**about, **row} for experiment in experiments for row in _rows(experiment, results, session["versions"])]
+    rows, verdicts = [], []
+    for experiment in experiments:
+        entries = _entries(experiment, results, session["versions"])
+        rows += [{**about, **row} for row in compared(entries)]
+        verdicts += [{"experiment": experiment.id, **judged(ordering, entries)} for ordering in orderings]
+    judge(verdicts)
     if shards is not None:
-        shards.close(rows, [_cost(experiment, results, rows) for experiment in experiments])
+        content = {"rows": rows} | ({"orderings": verdicts} if verdicts else {})
+        shards.close(content, [_cost(experiment, results, rows) for experiment in experiments])
     return rows
 
 
-def _rows(experiment: Experiment, results: Results, versions: dict[str, str]) -> list[dict[str, Any]]:
+def _entries(experiment: Experiment, results: Results, versions: dict[str, str]) -> list[Entry]:
     found = results.tallies(experiment.id)
     # A resumed run may have gone on with other code.
     commits = sorted({facts["commit"] or "unknown" for facts in results.facts(experiment.id)})
@@ -138,7 +148,7 @@ def _rows(experiment: Experiment, results: Results, versions: dict[str, str]) ->
         names = {"target": head["target"], "method": method.name, "options": dict(method.options)}
         row = names | head | {"disturbance": method.disturbance.rates()} | tally.row()
         entries.append(Entry(method, row, tally.episodes))
-    return compared(entries)
+    return entries
 
 
 def _cost(experiment: Experiment, results: Results, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 from .methods import EVALUATION_ONLY, Method
@@ -23,6 +24,43 @@ class Entry:
     @property
     def competes(self) -> bool:
         return self.method.name not in EVALUATION_ONLY and bool(self.sums)
+
+
+@dataclass(frozen=True)
+class Ordering:
+    """Somebody's word on F1: every method of `higher` is ahead of every method of `lower`."""
+
+    says: str
+    lower: tuple[str, ...]
+    higher: tuple[str, ...]
+
+
+BORNE_OUT, CONTRADICTED, OPEN = "borne out", "contradicted", "open"
+
+
+def judged(ordering: Ordering, entries: Sequence[Entry]) -> dict[str, Any]:
+    """What the data say of an ordering, in one experiment.
+
+    Returns:
+        `says`; `verdict`: "borne out" where every pair differs as said and by more than noise, "contradicted" where
+        some pair differs the other way by more than noise, else "open"; `pairs`: for each, `higher`, `lower`,
+        `difference` of F1 with `low`, `high` and `p_value`.
+    """
+    known = {e.method.label: e for e in entries if e.sums}
+    pairs = []
+    verdict = BORNE_OUT
+    for high, low in product(ordering.higher, ordering.lower):
+        if high not in known or low not in known:
+            return {"says": ordering.says, "verdict": OPEN, "pairs": []}
+        d = paired_difference(known[high].sums, known[low].sums)
+        if not d.noise and d.value < 0:
+            verdict = CONTRADICTED
+        elif d.noise and verdict == BORNE_OUT:
+            verdict = OPEN
+        pairs.append(
+            {"higher": high, "lower": low, "difference": d.value, "low": d.low, "high": d.high, "p_value": d.p_value}
+        )
+    return {"says": ordering.says, "verdict": verdict, "pairs": pairs}
 
 
 def compared(entries: Sequence[Entry]) -> list[dict[str, Any]]:

@@ -62,9 +62,9 @@ class Shards:
         sessions = [*before.get("sessions", []), dict(session)]
         write_json(file, {"format": "covis-run", "version": 1, "sessions": sessions, "plan": plan})
 
-    def close(self, rows: Sequence[Mapping[str, Any]], cost: Sequence[Mapping[str, Any]]) -> None:
+    def close(self, rows: Mapping[str, Any], cost: Sequence[Mapping[str, Any]]) -> None:
         """Write rows.json, and what the run has cost into run.json."""
-        write_json(self.out / ROWS, {"rows": rows})
+        write_json(self.out / ROWS, rows)
         write_json(self.out / RUN, json.loads((self.out / RUN).read_text()) | {"cost": cost})
 
     def finished(self) -> set[int]:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from .comparison import Ordering
 from .experiments import Experiment
 from .settings import Settings
 
@@ -14,6 +15,16 @@ TABLE_1 = ("rrwm", "icp", "bcagm", "rrwhm", "reid", "mos", "rgm-no-uncertainty",
 BASELINES = ("oracle", "random")
 """In every suite: what is possible at all, and what chance does."""
 ALL = (*TABLE_1, "bayes", "clipper", *BASELINES)
+
+SPATIAL = ("rrwm", "icp", "bcagm", "rrwhm")
+ABLATIONS = ("rgm-no-uncertainty", "rgm-no-covisibility")
+TABLE_1_ORDER = (
+    Ordering("the paper: spatial methods below ReId (but for S-MRC)", SPATIAL, ("reid",)),
+    Ordering("the paper: spatial methods below MOS", SPATIAL, ("mos",)),
+    Ordering("the paper: ReId and MOS below rgm", ("reid", "mos"), ("rgm",)),
+    Ordering("the paper: rgm above both ablations", ABLATIONS, ("rgm",)),
+    Ordering("ours: bayes above all others", (*TABLE_1, "clipper"), ("bayes",)),
+)
 
 FIVE_SEEDS = (1001, 1002, 1003, 1004, 1005)
 RATES = (0.03, 0.06, 0.09, 0.12, 0.15)
@@ -31,6 +42,7 @@ class Suite:
         experiments: what is run; every method of an experiment sees the same frames.
         disturbances: every method but the baselines, which heed no graph, is run under each of them (see
             `covis.evaluation.disturbance`); "" is none.
+        orderings: what the results are held against.
     """
 
     id: str
@@ -38,6 +50,7 @@ class Suite:
     title: str
     experiments: tuple[Experiment, ...]
     disturbances: tuple[str, ...] = ("",)
+    orderings: tuple[Ordering, ...] = ()
 
     def plan(self, more_methods: Sequence[str] = (), **changes: Any) -> list[Experiment]:
         """The experiments as they are run: with further methods, and with `changes` of their settings."""
@@ -74,6 +87,7 @@ SUITES: dict[str, Suite] = {
             _scene("multi_robot", ALL, FROM_PIXELS, FIVE_SEEDS),
             _scene("aerial_ground", ALL, FROM_PIXELS, FIVE_SEEDS),
         ),
+        orderings=TABLE_1_ORDER,
     ),
     "paper-fig7": Suite(
         "paper-fig7",

@@ -53,7 +53,8 @@ def benchmark(
         return
     given = {"pose": pose, "preset": preset, "min_common": min_common, "sequence": sequence or None, "seed": seed}
     changes = {"episodes": episodes, "perception": perception}
-    how = {"workers": workers, "engine": engine, "ray_address": ray_address}
+    verdicts: list[dict[str, Any]] = []
+    how: dict[str, Any] = {"workers": workers, "engine": engine, "ray_address": ray_address}
     how |= {"out": out_dir, "resume": resume, "overwrite": overwrite}
     try:
         if (resume or overwrite) and out_dir is None:
@@ -63,7 +64,8 @@ def benchmark(
         if figure is not None:
             require("viz")
         with progress_bar("benchmark") as progress:
-            rows = _run(targets, method or [], _only(given), _only(changes), how | {"progress": progress})
+            how |= {"progress": progress, "judge": verdicts.extend}
+            rows = _run(targets, method or [], _only(given), _only(changes), how)
     except (ValueError, RuntimeError, OSError) as error:
         fail(error)
     except KeyboardInterrupt:
@@ -75,6 +77,8 @@ def benchmark(
         save(benchmark_figure(rows), figure)
     if json_target != "-":
         out.print(table(rows))
+        if verdicts:
+            out.print(verdict_table(verdicts))
 
 
 def _run(
@@ -156,6 +160,16 @@ def table(rows: list[dict[str, Any]]) -> Table:
     for row, after in zip(rows, [*rows[1:], None], strict=True):
         last = after is None or _target(after) != _target(row)
         view.add_row(*(cell(row) for _, _, cell in shown), end_section=last)
+    return view
+
+
+def verdict_table(verdicts: list[dict[str, Any]]) -> Table:
+    """What the data say of orderings, with the pair that fits the least."""
+    view = Table("experiment", "who says what of F1", "verdict", "least difference", header_style="bold")
+    for verdict in verdicts:
+        least = min(verdict["pairs"], key=lambda pair: pair["difference"], default=None)
+        shown = "" if least is None else f"{least['difference']:+.3f} {least['higher']} to {least['lower']}"
+        view.add_row(verdict["experiment"], verdict["says"], verdict["verdict"], shown)
     return view
 
 

@@ -1,10 +1,13 @@
 """Suites are data, and run; a method of one's own joins them."""
 
 import json
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from covis.evaluation.benchmark import benchmark_suite
+from covis.evaluation.comparison import Entry, Ordering, judged
 from covis.evaluation.experiments import units_of
 from covis.evaluation.methods import EVALUATION_ONLY, Method
 from covis.evaluation.settings import SCENE_NAMES
@@ -62,6 +65,32 @@ def test_table_1_is_the_papers():
         assert len(TABLE_1) == 9
         assert len(experiment.seeds) == 5
         assert (experiment.settings.pose, experiment.settings.perception) == ("unknown", "learned")
+
+
+def entry(label, correct):
+    sums = {k: np.array([c, 10, 10], dtype=float) for k, c in enumerate(correct)}
+    return Entry(Method.parse(label), {"f1": sum(correct) / (10 * len(correct))}, sums)
+
+
+@pytest.mark.parametrize(
+    ("rgm", "verdict"), [([6] * 8, "borne out"), ([2] * 8, "contradicted"), ([4, 6, 3, 5, 5, 3, 4, 5], "open")]
+)
+def test_an_ordering_is_borne_out_contradicted_or_open(rgm, verdict):
+    entries = [entry("mos", [4, 4, 4, 4, 4, 4, 4, 5]), entry("reid", [1] * 8), entry("rgm", rgm)]
+    ordering = Ordering("rgm is ahead", ("mos", "reid"), ("rgm",))
+    found = judged(ordering, entries)
+    assert found["verdict"] == verdict
+    assert [(p["higher"], p["lower"]) for p in found["pairs"]] == [("rgm", "mos"), ("rgm", "reid")]
+    assert judged(ordering, entries[:1])["verdict"] == "open"
+
+
+def test_verdicts_are_handed_out_and_kept(small, tmp_path):
+    suite = replace(small, experiments=small.experiments[:1], orderings=(Ordering("so", ("random",), ("oracle",)),))
+    heard = []
+    benchmark_suite(suite, changes={"episodes": 8}, out=tmp_path, judge=heard.extend)
+    (verdict,) = heard
+    assert (verdict["experiment"], verdict["verdict"]) == ("synthetic-cad-mid", "borne out")
+    assert json.loads((tmp_path / "rows.json").read_text())["orderings"] == heard
 
 
 def test_disturbances_cross_every_method_but_the_baselines():
