@@ -5,9 +5,11 @@ import shutil
 
 import cv2
 import numpy as np
+import pandas
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import yaml
 from pycocotools import mask as coco_mask
 
 from covis.evaluation import recording
@@ -88,6 +90,42 @@ def test_masks_and_boxes_are_of_what_the_image_shows(recorded):
         assert row["box"] == [u.min(), v.min(), u.max() + 1, v.max() + 1]
         blue, _, red = np.median(image[mask], axis=0)
         assert (row["class"] == "red") == (red > blue)
+
+
+def test_pandas_reads_it(recorded):
+    robots, objects = (pandas.read_parquet(recorded / f"{t}.parquet") for t in ("robots", "objects"))
+    assert len(robots.merge(objects, on=["frame", "robot"])) == len(objects)
+    assert robots["pose"].map(len).eq(16).all()
+
+
+def test_polars_reads_it(recorded):
+    polars = pytest.importorskip("polars", reason="polars is not among the development packages")
+    assert (
+        polars.read_parquet(recorded / "objects.parquet").height
+        == pq.read_metadata(recorded / "objects.parquet").num_rows
+    )
+
+
+def test_the_data_card_tells_hugging_face_what_the_tables_hold(recorded):
+    front, body = (recorded / "README.md").read_text().removeprefix("---\n").split("---\n", 1)
+    head = yaml.safe_load(front)
+    assert {c["config_name"]: c["data_files"] for c in head["configs"]} == {t: f"{t}.parquet" for t in recording.TABLES}
+    assert [c["config_name"] for c in head["configs"] if c.get("default")] == ["robots"]
+    for info in head["dataset_info"]:
+        schema = pq.read_schema(recorded / f"{info['config_name']}.parquet")
+        assert [feature["name"] for feature in info["features"]] == schema.names
+    assert all(f"| `{name}` |" in body for schema in recording.TABLES.values() for name in schema.names)
+
+
+def test_hugging_face_reads_it(recorded, monkeypatch, tmp_path):
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    monkeypatch.setenv("HF_HOME", str(tmp_path))
+    datasets = pytest.importorskip("datasets", reason="Hugging Face's datasets is not among the development packages")
+    robots = datasets.load_dataset(str(recorded), split="train")
+    assert robots[0]["image"].size == (320, 240)
+    for table in recording.TABLES:
+        rows = pq.read_metadata(recorded / f"{table}.parquet").num_rows
+        assert len(datasets.load_dataset(str(recorded), table, split="train")) == rows
 
 
 @pytest.mark.parametrize("mask", [[[0, 1], [1, 0]], [[1, 1], [1, 1]], [[0, 0], [0, 0]], [[1, 0], [0, 0]]])
