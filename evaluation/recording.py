@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from .data_card import card
 from .dataset_tables import FORMAT, VERSION
-from .engine import Done, Failure, make_executor
+from .engine import Done, Executor, Failure, make_executor
 from .settings import Settings, scene_preset
 from .shards import write_atomically
 
@@ -105,11 +105,20 @@ def record(
     """
     episodes = settings.episodes or EPISODES
     request = {"scene": scene} | {key: getattr(settings, key) for key in ("preset", "seed", "perception", "n_robots")}
-    if not _prepare(out, request, episodes, resume, overwrite):
+    if resume and (_stored(out / HEAD) or {}).get("recording") == request | {"episodes": episodes}:
+        _tidy(out)
         return
+    goes_on = resume and _stored(out / REQUEST) == request
+    if not goes_on:
+        _refuse_to_replace(out, overwrite)
+    executor = make_executor("local", workers)
+    from .run_scene import make_eyes
+
     env = _own_env(scene, settings)
     try:
-        _record_parts(RecordOne(scene, settings, out / "parts"), episodes, workers, progress)
+        make_eyes(settings, env)  # what cannot be recorded is found out before anything is replaced
+        _begin(out, request, goes_on)
+        _record_parts(RecordOne(scene, settings, out / "parts"), episodes, executor, progress)
         head = _head(scene, env, settings) | {"recording": request | {"episodes": episodes}}
     finally:
         env.close()
@@ -130,9 +139,10 @@ def _finish(out: Path, head: dict[str, Any], episodes: int) -> None:
 
 def _tidy(out: Path) -> None:
     """Remove what only an unfinished recording needs, and what killed ones left."""
-    shutil.rmtree(out / "parts", ignore_errors=True)
-    for name in FILES:
-        for leftover in out.glob(f"{name}.*tmp"):
+    if (out / REQUEST).exists():
+        shutil.rmtree(out / "parts", ignore_errors=True)
+    for name in (*FILES, REQUEST):
+        for leftover in out.glob(f"{name}.*.tmp"):
             leftover.unlink()
     (out / REQUEST).unlink(missing_ok=True)
 
@@ -144,35 +154,34 @@ def unfinished(out: Path) -> int | None:
     return len(list((out / "parts").glob(f"{list(TABLES)[-1]}-*.parquet")))
 
 
-def _prepare(out: Path, request: dict[str, Any], episodes: int, resume: bool, overwrite: bool) -> bool:
-    """Make the folder ready to record into, empty or to be gone on with; False when it is finished already."""
+def _refuse_to_replace(out: Path, overwrite: bool) -> None:
+    """Raise unless the folder is free, or holds what may be overwritten; nobody else's files ever are."""
     begun, head = _stored(out / REQUEST), _stored(out / HEAD)
-    if resume and head is not None and head.get("recording") == request | {"episodes": episodes}:
-        _tidy(out)
-        return False
-    if not (resume and begun == request):
-        if not overwrite:
-            _refuse_to_replace(out, begun, head)
-        shutil.rmtree(out / "parts", ignore_errors=True)
-    (out / "parts").mkdir(parents=True, exist_ok=True)
-    write_atomically(out / REQUEST, json.dumps(request).encode())
-    # From here on the folder is an unfinished recording; of an overwritten dataset dataset.json goes first.
-    for name in FILES:
-        (out / name).unlink(missing_ok=True)
-    return True
-
-
-def _refuse_to_replace(out: Path, begun: dict[str, Any] | None, head: dict[str, Any] | None) -> None:
-    if head is not None:
+    if head is not None and not overwrite:
         raise FileExistsError(f"{out} holds a dataset already; give --overwrite to replace it")
-    if begun is not None:
+    if begun is not None and not overwrite:
         raise FileExistsError(
             f"{out} holds an unfinished recording of {begun}; give --resume to go on with the same, "
             "--overwrite to replace it"
         )
     there = [name for name in (*FILES, "parts") if (out / name).exists()]
-    if there:
+    if head is None and begun is None and there:
         raise FileExistsError(f"{out} holds files of another kind ({', '.join(there)}); choose another folder")
+
+
+def _begin(out: Path, request: dict[str, Any], goes_on: bool) -> None:
+    """Make the folder an unfinished recording.
+
+    Killed between any two of these lines, it can still be gone on with or overwritten: recording.json comes before
+    parts and goes after them, and of a dataset that is overwritten dataset.json goes first.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    if not goes_on:
+        shutil.rmtree(out / "parts", ignore_errors=True)
+    write_atomically(out / REQUEST, json.dumps(request).encode())
+    (out / "parts").mkdir(exist_ok=True)
+    for name in FILES:
+        (out / name).unlink(missing_ok=True)
 
 
 def _stored(file: Path) -> dict[str, Any] | None:
@@ -203,12 +212,14 @@ class RecordOne:
         return Done(None)
 
 
-def _record_parts(record_one: RecordOne, episodes: int, workers: int, progress: Callable[[int, int], None]) -> None:
+def _record_parts(
+    record_one: RecordOne, episodes: int, executor: Executor, progress: Callable[[int, int], None]
+) -> None:
     """Part files of every episode that has none yet. Raises what an episode raised, or that its worker died."""
     todo = [e for e in range(episodes) if not all(_part(record_one.parts, table, e).exists() for table in TABLES)]
     done = episodes - len(todo)
     progress(done, episodes)
-    for count, (_, outcome) in enumerate(make_executor("local", workers)(todo, record_one), done + 1):
+    for count, (_, outcome) in enumerate(executor(todo, record_one), done + 1):
         if isinstance(outcome, Failure):
             raise outcome.error
         progress(count, episodes)

@@ -104,20 +104,25 @@ def test_killed_runs_resume_to_the_same_results(what, tmp_path, dataset_writer, 
     expected = result(tmp_path / "undisturbed")
 
     rng = random.Random(f"kill {what}")
+    plans = [[{"die_at": 1}], [{"die_at": 2 * renames}]]  # the first and the last rename, then at random
     kills = trial = 0
     while kills < KILLS:
-        trial += 1
         assert trial < 5 * KILLS, "most runs were over before they were killed"
+        plan = plans[trial] if trial < len(plans) else random_moments(rng, seconds, renames)
+        trial += 1
         out = tmp_path / f"killed-{trial}"
-        for _ in range(rng.randint(1, 3)):
-            moment = (
-                {"kill_after": rng.uniform(0, seconds)}
-                if rng.random() < 0.5
-                else {"die_at": rng.randint(1, 2 * renames)}
-            )
+        for moment in plan:
             status, _, _ = runs.run(out, **moment)
             assert status in (0, -signal.SIGKILL)
             kills += status != 0
         assert runs.run(out)[0] == 0
         assert result(out) == expected, f"trial {trial} of {what}"
     print(f"{what}: {kills} kills in {trial} runs, each of {seconds:.1f} s and {renames} renames")
+
+
+def random_moments(rng, seconds, renames):
+    """When to kill one run, up to three times."""
+    return [
+        {"kill_after": rng.uniform(0, seconds)} if rng.random() < 0.5 else {"die_at": rng.randint(1, 2 * renames)}
+        for _ in range(rng.randint(1, 3))
+    ]

@@ -174,9 +174,20 @@ def test_nothing_is_overwritten_unasked(recorded, tmp_path):
     record(SCENE, SETTINGS, recorded, resume=True)
     assert before == {f.name: f.stat().st_mtime_ns for f in recorded.iterdir()}
     (tmp_path / "README.md").write_text("mine")
-    with pytest.raises(FileExistsError, match=r"files of another kind \(README.md\)"):
-        record(SCENE, SETTINGS, tmp_path, resume=True)
+    for option in ("resume", "overwrite"):
+        with pytest.raises(FileExistsError, match=r"files of another kind \(README.md\)"):
+            record(SCENE, SETTINGS, tmp_path, **{option: True})
     assert (tmp_path / "README.md").read_text() == "mine"
+
+
+def test_what_cannot_be_recorded_replaces_nothing(recorded):
+    before = {f.name: f.stat().st_mtime_ns for f in recorded.iterdir()}
+    with pytest.raises(ValueError, match="workers must be at least 1, got 0"):
+        record(SCENE, Settings(perception="simulated"), recorded, workers=0, overwrite=True)
+    pytest.importorskip("torch", reason="learned eyes need covis[learned]")
+    with pytest.raises(ValueError, match="does not know the class"):
+        record(SCENE, Settings(perception="learned"), recorded, overwrite=True)
+    assert before == {f.name: f.stat().st_mtime_ns for f in recorded.iterdir()}
 
 
 def test_overwriting_replaces_another_dataset(recorded, tmp_path):
