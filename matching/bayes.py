@@ -18,10 +18,10 @@ from .bayes_view import View
 from .graph import DEFAULT_BEARING_STD_RAD, Hypothesis, Matching, ObjectGraph, check_comparable
 from .pose import Array, RelativePose
 
-HALF_RANGE_QUANTILE = 0.65
+HALF_RANGE_QUANTILE = 0.85
 OCCLUDER = 0.022
 OCCLUDED = 0.75
-POSE_CONCENTRATION = 1.8
+POSE_CONCENTRATION = 1.0
 """Nats by which poses of views that share objects are more concentrated than the uniform prior says (fitted)."""
 
 LEAST_HYPOTHESIS = 0.01
@@ -44,11 +44,11 @@ def bayes(
     bearing_std_rad: float = DEFAULT_BEARING_STD_RAD,
     class_sharpness: float = 2.25,
     mislabel: float = 0.01,
-    extent: float = 0.018,
+    extent: float = 0.009,
     depth_offset: float = 0.035,
     depth_offset_std: float = 0.015,
     scale_std: float = 0.0,
-    detection: float = 0.9,
+    detection: float = 0.75,
     screened: int = 300,
     refined: int = 8,
     rescale: bool = True,
