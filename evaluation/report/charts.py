@@ -21,7 +21,6 @@ class Axis:
     high: float
     ticks: Sequence[float]
     log: bool = False
-    form: str = "{:g}"
 
     def share(self, value: float) -> float:
         """Where a value lies, 0 to 1 within the axis."""
@@ -44,6 +43,11 @@ class Series:
     labelled: bool = False
     classes: str = ""
     notes: Sequence[str] = field(default_factory=tuple)
+
+
+def tick_text(value: float) -> str:
+    """A number in few letters: 0.25, 1000, 10k."""
+    return f"{value / 1000:g}k" if abs(value) >= 10_000 else f"{value:g}"
 
 
 UNIT_TICKS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
@@ -101,11 +105,11 @@ def _axes(x: Axis, y: Axis, to_x: Callable[[float], float], to_y: Callable[[floa
     for tick in y.ticks:
         v = to_y(tick)
         out.append(h("line", {"class": "grid", "x1": LEFT, "x2": WIDTH - RIGHT, "y1": v, "y2": v}))
-        out.append(h("text", {"class": "tick", "x": LEFT - 6, "y": v + 4, "text-anchor": "end"}, y.form.format(tick)))
+        out.append(h("text", {"class": "tick", "x": LEFT - 6, "y": v + 4, "text-anchor": "end"}, tick_text(tick)))
     for tick in x.ticks:
         u = to_x(tick)
         out.append(h("line", {"class": "grid", "x1": u, "x2": u, "y1": TOP, "y2": bottom}))
-        words = x.form.format(tick)
+        words = tick_text(tick)
         out.append(h("text", {"class": "tick", "x": u, "y": bottom + 16, "text-anchor": "middle"}, words))
     out.append(h("text", {"class": "label", "x": middle, "y": HEIGHT - 6, "text-anchor": "middle"}, x.label))
     across = (TOP + bottom) / 2
@@ -144,7 +148,7 @@ def marker(method: int | None, u: float, v: float, note: str = "") -> Element:
         "M0-4.4L4.2 3H-4.2z",
         "M0-4.8L4.4 0L0 4.8L-4.4 0z",
         "M0 4.4L4.2-3H-4.2z",
-        "M-4.2 0L-2.1-3.6H2.1L4.2 0L2.1 3.6H-2.1z",
+        "M-4.6-1.8h9.2v3.6h-9.2z",
         "M-4-1.8L-1.8-4L0-2.2L1.8-4L4-1.8L2.2 0L4 1.8L1.8 4L0 2.2L-1.8 4L-4 1.8L-2.2 0z",
         "M-1.4-4.2h2.8v2.8h2.8v2.8h-2.8v2.8h-2.8v-2.8h-2.8v-2.8h2.8z",
     )

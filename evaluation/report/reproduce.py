@@ -5,9 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 from .html import Child, Element, h
-from .run import Run
+from .run import Group, Run
 
 SETTINGS = ("pose", "preset", "perception", "sequence", "min_common", "episodes")
+OF_SCENES = ("preset", "perception")
+"""Settings that only scenes have."""
 
 
 def section(run: Run) -> Element:
@@ -39,7 +41,7 @@ def _session(session: dict[str, Any], number: int, n: int) -> Element:
         ("command", h("code", None, str(session.get("command", "unknown")))),
         ("commit", h("code", None, str(session.get("commit") or "unknown: not run from a git checkout"))),
         ("versions", versions),
-        ("renderer", str(session.get("renderer", "unknown"))),
+        ("renderer of scenes", str(session.get("renderer", "unknown"))),
         ("machine", str(session.get("machine", "unknown"))),
         ("started", str(session.get("started", "unknown"))),
     ]
@@ -57,7 +59,7 @@ def _plan(run: Run) -> Element:
             group.id,
             group.target,
             ", ".join(map(str, group.seeds)),
-            *(said(group.settings.get(k)) for k in SETTINGS),
+            *(_setting(group, k) for k in SETTINGS),
         ]
         rows.append(h("tr", {"data-t": group.number}, [h("td", None, c) for c in cells]))
     body = h(
@@ -69,6 +71,10 @@ def _plan(run: Run) -> Element:
     return h(
         "div", {"class": "scroll", "tabindex": "0", "role": "region", "aria-label": "Experiments of the run"}, body
     )
+
+
+def _setting(group: Group, name: str) -> str:
+    return "" if name in OF_SCENES and group.kind != "scene" else said(group.settings.get(name))
 
 
 def said(value: Any) -> str:

@@ -70,6 +70,7 @@ class Group:
 
     number: int
     id: str
+    kind: str
     name: str
     target: str
     settings: dict[str, Any]
@@ -153,6 +154,7 @@ def _group(
     return Group(
         number=number,
         id=str(experiment["id"]),
+        kind=str(experiment["kind"]),
         name=target if experiment["kind"] == "dataset" else str(experiment["id"]),
         target=target,
         settings=dict(experiment["settings"]),

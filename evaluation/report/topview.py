@@ -13,7 +13,8 @@ from .charts import path
 from .html import Child, Element, h, number
 from .run import Group
 
-WIDTH, HEIGHT, MARGIN = 360, 300, 14
+WIDTH, HEIGHT, MARGIN, BOTTOM = 360, 300, 14, 28
+"""Below the map is room for its scale."""
 MAX_TRACKS = 3
 MIN_FRAMES = 3
 MIN_PATH_M = 0.2
@@ -37,7 +38,7 @@ class View:
     def __call__(self, point: Sequence[float] | Points) -> tuple[float, float]:
         return (
             self.u0 + MARGIN + (point[0] - self.left) * self.scale,
-            HEIGHT - MARGIN - (point[1] - self.bottom) * self.scale,
+            HEIGHT - BOTTOM - (point[1] - self.bottom) * self.scale,
         )
 
 
@@ -45,8 +46,9 @@ def view_of(points: Points, width: float = WIDTH, u0: float = 0.0) -> View:
     """Fits points (n, 2) m into a part of the picture."""
     low, high = points.min(axis=0), points.max(axis=0)
     span = np.maximum(high - low, 1e-3)
-    scale = float(min((width - 2 * MARGIN) / span[0], (HEIGHT - 2 * MARGIN) / span[1]))
-    free = (np.array([width, HEIGHT]) - 2 * MARGIN - span * scale) / (2 * scale)
+    room = np.array([width - 2 * MARGIN, HEIGHT - MARGIN - BOTTOM])
+    scale = float((room / span).min())
+    free = (room - span * scale) / (2 * scale)
     return View(float(low[0] - free[0]), float(low[1] - free[1]), scale, u0)
 
 
