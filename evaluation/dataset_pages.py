@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -69,47 +70,44 @@ def _result(method: str, found: Sequence[tuple[Record, np.ndarray]], numbers: di
 
 
 def with_images(dataset: Dataset, pages: Sequence[Page]) -> list[Page]:
-    """The pages with images (where `robots.parquet` has them) and boxes (where `detections.parquet` has them)."""
+    """The pages, those of role `episode` apart, with images and boxes where the tables have both."""
     wanted = sorted({p.frame for p in pages if p.role != "episode"})
     images = _column(dataset.path / "robots.parquet", "image", wanted)
     boxes = _column(dataset.path / "detections.parquet", "box", wanted)
+    if not images or not boxes:
+        return list(pages)
     order = {
         (frame.index, view.robot): view.order
         for frame in (dataset.frame(int(i)) for i in np.flatnonzero(np.isin(dataset.frame_index, wanted)))
         for view in frame.views
     }
-    if not images or not boxes:
-        return list(pages)
-    out = []
-    for kept in pages:
-        if kept.role == "episode":
-            out.append(kept)
-            continue
-        sights = [
-            replace(
-                sight,
-                image=recompressed(images[kept.frame, sight.robot][0]),
-                boxes=[rounded(boxes[kept.frame, sight.robot][k]) for k in order[kept.frame, sight.robot]],
-            )
-            if (kept.frame, sight.robot) in images and len(sight.identity)
-            else sight
-            for sight in kept.sights
-        ]
-        out.append(replace(kept, sights=sights, image_size=_size(dataset)))
-    return out
+    return [page if page.role == "episode" else _illustrated(page, images, boxes, order) for page in pages]
 
 
-def _size(dataset: Dataset) -> list[int] | None:
-    size = dataset._meta["image_size"]
-    return None if size is None else list(size)
+Stored = dict[tuple[int, str], list[Any]]
 
 
-def _column(file: Path, name: str, frames: Sequence[int]) -> dict[tuple[int, str], list[Any]]:
+def _illustrated(page: Page, images: Stored, boxes: Stored, order: dict[tuple[int, str], Any]) -> Page:
+    """With images and boxes of its sights; as it is when one of them lacks either."""
+    sights, size = [], None
+    for sight in page.sights:
+        at = page.frame, sight.robot
+        if at not in images or len(boxes.get(at, ())) != len(sight.identity):
+            return page
+        png = images[at][0]
+        # A PNG begins with its signature and the header's length and type, then its width and height.
+        size = list(struct.unpack(">II", png[16:24]))
+        own = [rounded(boxes[at][k]) for k in order[at]]
+        sights.append(replace(sight, image=recompressed(png), boxes=own))
+    return replace(page, sights=sights, image_size=size)
+
+
+def _column(file: Path, name: str, frames: Sequence[int]) -> Stored:
     """The values of a column by frame and robot, in stored order; nothing when the file lacks it."""
     if not frames or name not in pq.read_schema(file).names:
         return {}
     table = pq.read_table(file, columns=["frame", "robot", name], filters=[("frame", "in", list(frames))])
-    found: dict[tuple[int, str], list[Any]] = {}
+    found: Stored = {}
     for row in table.to_pylist():
         if row[name] is not None:
             found.setdefault((row["frame"], row["robot"]), []).append(row[name])

@@ -31,7 +31,10 @@ class Axis:
 
 @dataclass(frozen=True)
 class Series:
-    """One line: points (x, y), and optionally an interval of y at each. `method` is its number, None = neutral."""
+    """One line: points (x, y), and optionally an interval of y and a note at each.
+
+    `method` is the number by which its looks go, None = neutral; `labelled` writes its name beside the last point.
+    """
 
     name: str
     points: Sequence[tuple[float, float]]
@@ -39,7 +42,6 @@ class Series:
     bounds: Sequence[tuple[float, float]] = ()
     line: bool = True
     markers: bool = False
-    step: bool = False
     labelled: bool = False
     classes: str = ""
     notes: Sequence[str] = field(default_factory=tuple)

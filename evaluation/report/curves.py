@@ -38,8 +38,8 @@ def panel(group: Group, figure: Element, legend: Sequence[tuple[int, str, str]] 
     return h("figure", {"class": "panel", "data-t": group.number}, figure, caption)
 
 
-def section(identifier: str, title: str, note: str, panels: Child, wide: bool = False) -> Element:
-    grid = h("div", {"class": "panels wide" if wide else "panels"}, panels)
+def section(identifier: str, title: str, note: str, panels: Child) -> Element:
+    grid = h("div", {"class": "panels"}, panels)
     return h("section", {"id": identifier}, h("h2", None, title), h("p", {"class": "note"}, note), grid)
 
 

@@ -30,12 +30,12 @@ def _table(group: Group) -> list[str]:
     for entry in sorted(group.entries, key=lambda e: -e.f1):
         cells = [escaped(entry.label), f"{entry.f1:.3f}", f"{entry.row['f1_low']:.3f} to {entry.row['f1_high']:.3f}"]
         cells.append(_difference(entry, entry is group.best))
-        cells += [_cell(group, entry, c.value(group, entry), c.form) for c in shown]
+        cells += [_cell(c.value(group, entry), c.form) for c in shown]
         lines.append("| " + " | ".join(cells) + " |")
     return lines
 
 
-def _cell(group: Group, entry: Entry, value: float | None, form: str) -> str:
+def _cell(value: float | None, form: str) -> str:
     return "" if value is None else form.format(value)
 
 

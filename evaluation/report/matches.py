@@ -51,8 +51,7 @@ def figure_6(groups: Sequence[Group], images: Images) -> Element | None:
     if not shown:
         return None
     note = (
-        "One frame of each target’s first episode, the one with most in common. Solid green: right; dashed red: "
-        "wrong. "
+        "One frame of each target’s first episode, the one with most in common. Solid green: right; dashed red: wrong. "
         "Boxes are detections. The paper’s Fig. 6."
     )
     blocks = [_side_by_side(group, page, images) for group, page in shown]
@@ -202,15 +201,13 @@ def _failure(group: Group, page: Page, images: Images) -> Element:
     title = f"{group.name}, {when(page)}: two robots’ views with matches"
     picture = frame(page, results, images, title, pick=True)
     told = [h("span", {"data-pick": method}, words(result)) for method, result in results]
-    best = max((r.counts.f1, m) for m, r in results if not group_entry(group, m).baseline)
-    others = (
-        f". Best here: {group_entry(group, best[1]).label}, F1 {best[0]:.2f}." if best[0] else ". No method did better."
-    )
+    best = max((r.counts.f1, m) for m, r in results if not _entry(group, m).baseline)
+    others = f". Best here: {_entry(group, best[1]).label}, F1 {best[0]:.2f}." if best[0] else ". No method did better."
     caption = h("figcaption", None, h("strong", None, when(page)), " ", told, others)
     return h("figure", {"class": "frame"}, picture, caption)
 
 
-def group_entry(group: Group, method: int) -> Entry:
+def _entry(group: Group, method: int) -> Entry:
     return next(e for e in group.entries if e.method == method)
 
 

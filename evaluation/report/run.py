@@ -64,8 +64,8 @@ class Entry:
 class Group:
     """One experiment with every method: a table of the leaderboard, a panel of each figure.
 
-    `target` is what its rows call it; `name` is that too, or its id where a target has several experiments. `entries`
-    got what the robots saw, `disturbed` got it made worse.
+    `target` is what its rows call it; `name` is that too, or its id where a target has several experiments. `disturbed`
+    are those of its methods that also run undisturbed, among the other `entries`.
     """
 
     number: int
@@ -151,6 +151,10 @@ def _group(
         for label, row in zip(experiment["methods"], told, strict=True)
     ]
     target = str(told[0]["target"])
+    # Beside its undisturbed self a disturbed method is a point of a curve; alone it is a method like others.
+    disturbed = [
+        e for e in entries if undisturbed(e.label) != e.label and undisturbed(e.label) in experiment["methods"]
+    ]
     return Group(
         number=number,
         id=str(experiment["id"]),
@@ -159,8 +163,8 @@ def _group(
         target=target,
         settings=dict(experiment["settings"]),
         seeds=list(experiment["seeds"]),
-        entries=[e for e in entries if undisturbed(e.label) == e.label],
-        disturbed=[e for e in entries if undisturbed(e.label) != e.label],
+        entries=[e for e in entries if e not in disturbed],
+        disturbed=disturbed,
         pages=[page for _, found in shards for page in found],
     )
 

@@ -1,6 +1,8 @@
 """Frames a run keeps for its report."""
 
+import cv2
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -75,6 +77,29 @@ def test_a_run_on_a_dataset_writes_pages_that_agree_with_its_records(small_datas
         sight = page.sights[0]
         error = np.linalg.norm(np.array(sight.places) - np.array(sight.truth), axis=1)
         assert error.max() < 0.5  # detections err by 0.05 m an axis: places are in the world frame
+
+
+def with_pictures(folder, width=40, height=30):
+    """Adds an image per robot and frame, and a box per detection, to a dataset folder."""
+    png = cv2.imencode(".png", np.zeros((height, width, 3), np.uint8))[1].tobytes()
+    robots, detections = (pq.read_table(folder / f"{name}.parquet") for name in ("robots", "detections"))
+    pq.write_table(robots.append_column("image", pa.array([png] * len(robots))), folder / "robots.parquet")
+    boxes = [[float(k), 0.0, k + 5.0, 9.0] for k in detections["detection"].to_pylist()]
+    pq.write_table(detections.append_column("box", pa.array(boxes)), folder / "detections.parquet")
+
+
+def test_pages_of_recorded_datasets_carry_images_and_boxes_in_the_order_of_the_detections(small_dataset, tmp_path):
+    with_pictures(small_dataset)
+    benchmark([str(small_dataset)], [Method.parse("oracle")], Settings(), out=tmp_path / "run")
+    pages = from_table(pq.read_table(tmp_path / "run" / "pictures" / "unit-00000.parquet"))
+    (shown,) = [p for p in pages if p.role == "showcase"]
+    assert shown.image_size == [40, 30]
+    stored = pq.read_table(small_dataset / "detections.parquet").to_pylist()
+    for sight in shown.sights:
+        assert sight.image.startswith(b"\xff\xd8")
+        own = {r["identity"]: r["box"] for r in stored if (r["frame"], r["robot"]) == (shown.frame, sight.robot)}
+        assert [own[identity] for identity in sight.identity] == sight.boxes
+    assert all(s.image is None for p in pages if p.role == "episode" for s in p.sights)
 
 
 def test_found_flags_count_what_was_matched_rightly(small_dataset, tmp_path):

@@ -8,6 +8,8 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from covis.evaluation.pictures import to_table as pictures_table
+from covis.evaluation.records import to_table as records_table
 from covis.evaluation.report import RunFolderError, write_report
 from covis.evaluation.report.charts import linear_axis, log_axis
 from covis.evaluation.report.curves import average_precision, binned, pr_curve
@@ -16,6 +18,7 @@ from covis.evaluation.report.leaderboard import signed, verdict
 from covis.evaluation.report.robustness import figure_7, rates
 from covis.evaluation.report.run import Entry, load
 from covis.evaluation.report.topview import best_tracks, episodes
+from covis.evaluation.shards import Shards
 
 from .conftest import METHODS, TARGETS, make_record, rows_of, write_run
 
@@ -215,6 +218,23 @@ def test_robustness_follows_the_rates_of_the_rows(run_folder):
     assert section is not None
     assert len(section.findall(".//figure")) == 2  # precision and recall
     assert figure_7([replace(group, disturbed=[])]) is None
+
+
+def test_a_disturbed_method_without_its_undisturbed_self_is_a_method_like_others(tmp_path):
+    folder = write_run(tmp_path)
+    for file in (folder / "run.json", folder / "rows.json"):
+        file.write_text(file.read_text().replace('"good"', '"rgm@position_noise=0.5"'))
+    group = load(folder).groups[0]
+    assert [e.label for e in group.entries] == ["rgm@position_noise=0.5", *METHODS[1:]]
+    assert write_report(folder).html.exists()
+
+
+def test_a_run_in_which_no_pair_was_matched_says_so_in_zeros(tmp_path):
+    folder = write_run(tmp_path, rows=False)
+    for number in range(2):
+        empty = {"records": records_table([]), "pictures": pictures_table([])}
+        Shards(folder, 2).write(number, empty)
+    assert "| good | 0.000 |" in write_report(folder).markdown.read_text()
 
 
 # Curves
