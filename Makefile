@@ -40,7 +40,7 @@ check: $(STAMP)
 
 # The book as a site; a broken link or a docstring that cannot be read fails. With SERVE=1 it is served, for its search.
 docs: $(STAMP)
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build # not --quiet: warnings that are not shown do not fail
 	@echo "build/site/index.html"
 	$(if $(SERVE),$(BIN)/python -m http.server --bind 127.0.0.1 --directory build/site 8000)
 

@@ -1,11 +1,15 @@
-"""MkDocs hook: links from the book into the code lead nowhere on the site, so they become the file's path."""
+"""MkDocs hooks: links from the book into the code become the file's path; nothing is loaded from elsewhere."""
 
 import re
 from pathlib import Path
 from typing import Any
 
+from mkdocs.exceptions import PluginError
+
 ROOT = Path(__file__).resolve().parents[1]
 LINK = re.compile(r"(?<!!)\[([^\]]+)\]\((?!https?://|#)([^)#\s]+)\)")
+
+FOREIGN = re.compile(r"<(?:script|img|iframe|source|link)\b[^>]*?\s(?:src|href)=[\"']?(?:https?:)?//[^\s>]+")
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
@@ -18,3 +22,10 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
         return f"{link[1]} (`{target.relative_to(ROOT)}`)"
 
     return LINK.sub(shown, markdown)
+
+
+def on_post_page(output: str, page: Any, **_: Any) -> str:
+    foreign = FOREIGN.search(output)
+    if foreign:
+        raise PluginError(f"{page.file.src_path} would load from elsewhere: {foreign[0]}")
+    return output
