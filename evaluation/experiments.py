@@ -93,28 +93,31 @@ class UnitResult:
 def run_unit(unit: Unit, pictures: bool = False) -> UnitResult:
     """Records of a unit, in order of time, pair and method; with `pictures` also the frames that a report shows."""
     experiment = unit.experiment
-    methods = [Method.parse(text) for text in experiment.methods]
-    if experiment.kind == "synthetic":
-        book = PictureBook(0) if pictures else None
-        frames = synthetic.frames(experiment.target, unit.seed, unit.episodes)
-        records = run_frames(target_name(experiment), frames, methods, unit.settings, book)
-        pages = [] if book is None else book.pages()
-    elif experiment.kind == "dataset":
-        data = dataset(experiment.target, unit.seed)
-        book = PictureBook(int(data.episode[0])) if pictures else None
-        records = run_episodes(data, unit.episodes, methods, unit.settings, book)
-        pages = [] if book is None else with_images(data, book.pages())
-    else:
-        # Imported here: matching on dataset folders runs without the simulators.
-        from . import run_scene
-
-        book = PictureBook(0) if pictures else None
-        records = run_scene.run_episodes(experiment.target, unit.episodes, methods, unit.settings, book)
-        pages = [] if book is None else book.pages()
+    data = dataset(experiment.target, unit.seed) if experiment.kind == "dataset" else None
+    book = PictureBook(0 if data is None else int(data.episode[0])) if pictures else None
+    records = _matched(unit, book)
+    pages = [] if book is None else book.pages()
+    if data is not None:
+        pages = with_images(data, pages)
     return UnitResult(
         [replace(r, experiment=experiment.id, seed=unit.seed) for r in records],
         [replace(page, seed=unit.seed) for page in pages],
     )
+
+
+def _matched(unit: Unit, book: PictureBook | None) -> list[Record]:
+    """Records of the unit's frames; `book` gets to see every frame."""
+    experiment, settings = unit.experiment, unit.settings
+    methods = [Method.parse(text) for text in experiment.methods]
+    if experiment.kind == "dataset":
+        return run_episodes(dataset(experiment.target, unit.seed), unit.episodes, methods, settings, book)
+    if experiment.kind == "synthetic":
+        frames = synthetic.frames(experiment.target, unit.seed, unit.episodes)
+        return run_frames(target_name(experiment), frames, methods, settings, book)
+    # Imported here: matching on dataset folders runs without the simulators.
+    from . import run_scene
+
+    return run_scene.run_episodes(experiment.target, unit.episodes, methods, settings, book)
 
 
 def target_name(experiment: Experiment) -> str:
