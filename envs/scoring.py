@@ -224,15 +224,22 @@ def tight_boxes(instances: NDArray[np.int32], m: int) -> tuple[Array, NDArray[np
     boxes = np.zeros((m, 4))
     pixels = np.zeros(m, dtype=np.int64)
     for v in range(height):
-        for u in range(width):
-            j = instances[v, u]
+        row = instances[v]
+        # Most of a picture is background: a row's greatest id is found in vector code.
+        if row.max() < 0:
+            continue
+        u = 0
+        while u < width:
+            j, first = row[u], u
+            while u < width and row[u] == j:
+                u += 1
             if j < 0:
                 continue
             if pixels[j] == 0:
-                boxes[j, 0], boxes[j, 1], boxes[j, 2], boxes[j, 3] = u, v, u + 1, v + 1
+                boxes[j, 0], boxes[j, 1], boxes[j, 2], boxes[j, 3] = first, v, u, v + 1
             else:
-                boxes[j, 0] = min(boxes[j, 0], u)
-                boxes[j, 2] = max(boxes[j, 2], u + 1)
+                boxes[j, 0] = min(boxes[j, 0], first)
+                boxes[j, 2] = max(boxes[j, 2], u)
                 boxes[j, 3] = v + 1
-            pixels[j] += 1
+            pixels[j] += u - first
     return boxes, pixels
