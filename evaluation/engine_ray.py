@@ -66,10 +66,11 @@ def _connected(address: str | None) -> Iterator[None]:
     _reach(address)
     # Nothing calls home from a benchmark.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    own = {"include_dashboard": False} if address is None else {}
     try:
-        ray.init(address or "local", log_to_driver=False, logging_level="ERROR", include_dashboard=None)
-    except ConnectionError as error:
-        raise RuntimeError(f"no Ray cluster at {address}: {error}") from error
+        ray.init(address or "local", log_to_driver=False, logging_level="ERROR", **own)
+    except Exception as error:  # Ray raises plain Exception, too, when a cluster does not come up in time
+        raise RuntimeError(f"no Ray cluster at {address or 'this machine'}: {error}") from error
     try:
         yield
     finally:

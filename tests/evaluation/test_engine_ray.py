@@ -36,13 +36,26 @@ def match(source, target, *, prior=None, rng=None, victim=""):
 @pytest.fixture
 def cluster(monkeypatch):
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    node = {"num_cpus": 1, "object_store_memory": 100_000_000, "include_dashboard": False}
-    cluster = Cluster(initialize_head=True, head_node_args=node)
-    cluster.second = cluster.add_node(**node)
-    cluster.wait_for_nodes()
+    cluster = two_nodes()
     yield cluster
     ray.shutdown()
     cluster.shutdown()
+
+
+def two_nodes(attempts=3):
+    """A cluster; Ray gives a node 30 s to come up, which a busy machine may need."""
+    node = {"num_cpus": 1, "object_store_memory": 100_000_000, "include_dashboard": False}
+    cluster = Cluster()
+    try:
+        cluster.add_node(**node)
+        cluster.second = cluster.add_node(**node)
+        cluster.wait_for_nodes()
+    except Exception as error:
+        cluster.shutdown()
+        if attempts == 1 or "timed out during startup" not in str(error):
+            raise
+        return two_nodes(attempts - 1)
+    return cluster
 
 
 @pytest.fixture
