@@ -22,12 +22,16 @@ OTHERS = ("#e69f00", "#009e73", "#d55e00", "#cc79a7", "#8c564b", "#7f7f7f", "#bc
 MARKERS = "osD^vP*Xdph<>8"
 
 
-def _figure(columns: int = 1, width: float = 5.2, height: float = 3.8) -> tuple[Figure, Any]:
-    """A figure that no window and no global state knows of."""
+def _figure(panels: int = 1, width: float = 5.2, height: float = 3.8) -> tuple[Figure, Any]:
+    """A figure that no window and no global state knows of, its panels in rows of at most four."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width * columns, height), layout="constrained")
-    axes = figure.subplots(1, columns, squeeze=False)[0]
+    columns, rows = min(panels, 4), -(-panels // 4)
+    figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for unused in axes[panels:]:
+        unused.remove()
+    axes = axes[:panels]
     for axis in axes:
         axis.spines[["top", "right"]].set_visible(False)
         axis.grid(alpha=0.25, linewidth=0.6)

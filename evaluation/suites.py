@@ -141,6 +141,7 @@ SUITES: dict[str, Suite] = {
             for place in ("cad", "smrc", "rmrc")
             for difficulty in ("hard", "mid", "moderate", "mixed")
         ),
+        orderings=TABLE_1_ORDER,
     ),
     "scaling-robots": Suite(
         "scaling-robots",
