@@ -37,7 +37,7 @@ class PoseFilterOptions:
     """
 
     walk_std_m: float = 0.2
-    walk_std_rad: float = 0.01
+    walk_std_rad: float = 0.03
     odometry_std_m: float = 0.01
     odometry_std_per_m: float = 0.05
     odometry_std_rad: float = 0.012

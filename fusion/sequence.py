@@ -16,6 +16,10 @@ MAX_SPREAD = 1e4
 """Trace of a pose's covariance (m^2 and rad^2) beyond which a hypothesis is no information."""
 
 
+FOLLOW_FLOOR = np.diag([0.05**2, 0.05**2, 0.05**2, 0.003**2])
+"""m^2 and rad^2 added to a pose that was followed: successive views share part of their errors."""
+
+
 @dataclass(frozen=True)
 class PairOptions:
     """How a pair's matcher is used over time.
@@ -24,14 +28,15 @@ class PairOptions:
         filter: of the relative pose.
         trust: probability of a pose from which it is handed to the matcher as prior.
         refuse: while none is trusted, matches whose score times the best pose's probability is lower are not made.
-        widen: factor on the prior's covariance; above 1 because errors of successive views are alike.
+        widen: factor on the covariance of a prior without odometry; above 1 because errors of successive views are
+            alike, and because cars turn faster than persistence expects.
         min_registered: matches a matcher without poses must give for one to be estimated.
     """
 
     filter: PoseFilterOptions = field(default_factory=PoseFilterOptions)
     trust: float = 0.7
     refuse: float = 0.3
-    widen: float = 1.0
+    widen: float = 4.0
     min_registered: int = 4
 
 
@@ -62,6 +67,7 @@ class PairTracker:
         self._ups: tuple[Array, Array] | None = None
         self._given: RelativePose | None = None
         self._pending: list[tuple[Array | None, Array | None]] = []
+        self._odometry = False
 
     def predict(self, odometry_source: Array | None = None, odometry_target: Array | None = None) -> None:
         """A frame has passed: each robot's own motion (4, 4) since the last, in sensor frames; None = unknown.
@@ -69,6 +75,7 @@ class PairTracker:
         To be called for every frame, also for those in which the pair is not matched.
         """
         self._pending.append((odometry_source, odometry_target))
+        self._odometry = odometry_source is not None and odometry_target is not None
 
     def prior(self, odometry_source: Array | None = None, odometry_target: Array | None = None) -> RelativePose | None:
         """Prior for this frame, after `predict`; None while no pose is trusted."""
@@ -125,13 +132,23 @@ class PairTracker:
             return _believed(alone, choice.probability, self.options.refuse)
         if choice.component >= 0:
             mean, covariance = before[choice.component]
-            covariance = covariance * self.options.widen
+            covariance = covariance if self._odometry else covariance * self.options.widen
             prior = from_levelled(mean, covariance, *self._ups)
         elif choice.hypothesis > 0:
             prior = found[choice.hypothesis][0]
         else:
             return alone
-        return matcher(source, target, prior=prior, rng=rng, **options)
+        matching = matcher(source, target, prior=prior, rng=rng, **options)
+        self._follow(matching)
+        return matching
+
+    def _follow(self, matching: Matching) -> None:
+        """Without odometry: let the trusted component go where the matches made with it as prior put the pose."""
+        if not self._odometry and matching.pose is not None and len(matching) >= 2:
+            assert self._ups is not None
+            best = int(np.argmax(self.filter.weights))
+            mean, covariance = to_levelled(matching.pose, *self._ups)
+            self.filter.means[best], self.filter.covariances[best] = mean, covariance + FOLLOW_FLOOR
 
     def _carry(self, up_source: Array, up_target: Array) -> None:
         """Apply the motions announced by `predict`; the tilt of frames in between is taken to be the last known one."""
