@@ -12,6 +12,8 @@ from .html import Child, Element, h
 from .run import Entry, Group
 
 MINUS = "−"
+TO = {"best": "to the best", "bayes": "to bayes"}
+"""Titles of the columns of differences."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +155,7 @@ def table(group: Group) -> Element:
         _header("Method", "", "name"),
         _header("F1", "Harmonic mean of precision and recall.", "num"),
         h("th", {"class": "graphic", "scope": "col"}, "95 % interval"),
-        _header("to the best", "Difference of F1 to the best method, and its 95 % interval.", "num"),
+        *(_header(TO[to], f"F1 less that of {to}, and its 95 % interval.", "num") for to in _compared_to(group)),
     ]
     head += [_header(c.title, c.meaning, f"num {c.kind}".strip()) for c in shown]
     first = group.entries[0].row
@@ -190,7 +192,7 @@ def _table_row(group: Group, entry: Entry, shown: list[Column]) -> Element:
         h("th", {"scope": "row", "class": "name", "data-v": entry.label}, key(entry.method), entry.label),
         h("td", {"class": "num strong", "data-v": _exact(entry.f1)}, f"{entry.f1:.3f}"),
         h("td", {"class": "graphic"}, interval(group, entry)),
-        _difference_cell(entry, best),
+        *(_difference_cell(entry, to, best) for to in _compared_to(group)),
     ]
     for column in shown:
         value = column.value(group, entry)
@@ -203,22 +205,30 @@ def _exact(value: float | None) -> str | None:
     return None if value is None else repr(float(value))
 
 
-def _difference_cell(entry: Entry, best: bool) -> Element:
-    if entry.to_best is None:
-        return h("td", {"class": "num", "data-v": "0" if best else None}, "best" if best else "")
-    value, low, high = entry.to_best
-    p = entry.row.get("p_value_best")
-    words = "Noise alone may explain it" if entry.level else "Not by noise alone" if not entry.baseline else "Baseline"
+def _difference_cell(entry: Entry, to: str, best: bool) -> Element:
+    """F1 less that of the best or of bayes, shaded where noise alone may explain a difference to the best."""
+    difference = entry.difference(to)
+    if difference is None:
+        itself = best if to == "best" else entry.label == to
+        return h("td", {"class": "num", "data-v": "0" if itself else None}, to if itself else "")
+    value, low, high = difference
+    noise = to == "best" and entry.level
+    p = entry.row.get("p_value_best" if to == "best" else "p_value")
     return h(
         "td",
         {
-            "class": "num difference" + (" noise" if entry.level else ""),
+            "class": "num difference" + (" noise" if noise else ""),
             "data-v": _exact(value),
-            "title": words if p is None else f"{words}: p = {p:.3g}",
+            "title": None if p is None else f"p = {p:.3g}",
         },
         signed(value),
         h("span", {"class": "bounds"}, f"{signed(low)} to {signed(high)}"),
     )
+
+
+def _compared_to(group: Group) -> list[str]:
+    """The best, and bayes where that is another."""
+    return ["best", *(["bayes"] if group.best.label != "bayes" and group.best.difference("bayes") else [])]
 
 
 def signed(value: float) -> str:

@@ -40,9 +40,10 @@ def _cell(value: float | None, form: str) -> str:
 
 
 def _difference(entry: Entry, best: bool) -> str:
-    if entry.to_best is None:
+    difference = entry.difference("best")
+    if difference is None:
         return "best" if best else ""
-    value, low, high = (signed(x) for x in entry.to_best)
+    value, low, high = (signed(x) for x in difference)
     return f"{value} ({low} to {high})" + (", noise" if entry.level else "")
 
 

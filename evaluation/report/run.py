@@ -48,11 +48,10 @@ class Entry:
     def f1(self) -> float:
         return float(self.row["f1"])
 
-    @property
-    def to_best(self) -> tuple[float, float, float] | None:
-        """F1 less the highest, and its 95 % interval; None for the best itself, and where nothing compares."""
-        values = [self.row.get(f"f1_minus_best{end}") for end in ("", "_low", "_high")]
-        return None if any(v is None for v in values) else (values[0], values[1], values[2])  # type: ignore[return-value]
+    def difference(self, to: str) -> tuple[float, float, float] | None:
+        """F1 less that of `best` or `bayes`, and its 95 % interval; None for that one itself, or without it."""
+        values = [self.row.get(f"f1_minus_{to}{end}") for end in ("", "_low", "_high")]
+        return None if None in values else (float(values[0]), float(values[1]), float(values[2]))  # type: ignore[arg-type]
 
     @property
     def level(self) -> bool:

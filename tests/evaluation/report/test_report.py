@@ -1,5 +1,6 @@
 """What the page and the Markdown say, against the rows they are made of."""
 
+import json
 import re
 import shutil
 from dataclasses import replace
@@ -194,6 +195,24 @@ def test_differences_are_those_of_the_rows(run_folder, outline):
     for row in rows:
         written = signed(row["f1_minus_best"]) + " to ".join(signed(row[f"f1_minus_best_{e}"]) for e in ("low", "high"))
         assert any(written in r for r in outline.rows)
+
+
+def test_bayes_is_compared_with_where_it_is_not_the_best(tmp_path):
+    folder = write_run(tmp_path)
+    run = (folder / "run.json").read_text()
+    (folder / "run.json").write_text(run.replace('"<b>bold</b>"', '"bayes"'))
+    rows = rows_of(folder)
+    for row in rows:
+        if row["method"] == "<b>bold</b>":
+            row |= {"method": "bayes", "f1_minus_bayes": 0.0, "f1_minus_bayes_low": None, "f1_minus_bayes_high": None}
+        else:
+            row |= {"f1_minus_bayes": 0.123, "f1_minus_bayes_low": -0.045, "f1_minus_bayes_high": 0.234}
+    (folder / "rows.json").write_text(json.dumps({"rows": rows}))
+    parser = Outline()
+    parser.feed(write_report(folder).html.read_text())
+    assert all("to bayes" in r for r in parser.rows if "to the best" in r)
+    (first, *_) = [r for r in parser.rows if r and r[0] == "good" and len(r) > 6]
+    assert first[3:5] == ["best", "+0.123−0.045 to +0.234"]
 
 
 # Robustness
