@@ -44,7 +44,7 @@ def bayes(
     bearing_std_rad: float = DEFAULT_BEARING_STD_RAD,
     class_sharpness: float = 2.25,
     mislabel: float = 0.01,
-    extent: float = 0.009,
+    extent: float = 0.013,
     depth_offset: float = 0.035,
     depth_offset_std: float = 0.015,
     scale_std: float = 0.0,
