@@ -5,14 +5,12 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 
 from ..matching.pose import Array, transform
-from .datasets import Dataset, Frame, View
+from .datasets import Dataset, Frame, Stored, View, optional_column
 from .pictures import Page, Result, Sight, recompressed, rounded
 from .records import Record
 
@@ -72,8 +70,8 @@ def _result(method: str, found: Sequence[tuple[Record, np.ndarray]], numbers: di
 def with_images(dataset: Dataset, pages: Sequence[Page]) -> list[Page]:
     """The pages, those of role `episode` apart, with images and boxes where the tables have both."""
     wanted = sorted({p.frame for p in pages if p.role != "episode"})
-    images = _column(dataset.path / "robots.parquet", "image", wanted)
-    boxes = _column(dataset.path / "detections.parquet", "box", wanted)
+    images = optional_column(dataset.path / "robots.parquet", "image", wanted)
+    boxes = optional_column(dataset.path / "detections.parquet", "box", wanted)
     if not images or not boxes:
         return list(pages)
     order = {
@@ -82,9 +80,6 @@ def with_images(dataset: Dataset, pages: Sequence[Page]) -> list[Page]:
         for view in frame.views
     }
     return [page if page.role == "episode" else _illustrated(page, images, boxes, order) for page in pages]
-
-
-Stored = dict[tuple[int, str], list[Any]]
 
 
 def _illustrated(page: Page, images: Stored, boxes: Stored, order: dict[tuple[int, str], Any]) -> Page:
@@ -100,15 +95,3 @@ def _illustrated(page: Page, images: Stored, boxes: Stored, order: dict[tuple[in
         own = [rounded(boxes[at][k]) for k in order[at]]
         sights.append(replace(sight, image=recompressed(png), boxes=own))
     return replace(page, sights=sights, image_size=size)
-
-
-def _column(file: Path, name: str, frames: Sequence[int]) -> Stored:
-    """The values of a column by frame and robot, in stored order; nothing when the file lacks it."""
-    if not frames or name not in pq.read_schema(file).names:
-        return {}
-    table = pq.read_table(file, columns=["frame", "robot", name], filters=[("frame", "in", list(frames))])
-    found: Stored = {}
-    for row in table.to_pylist():
-        if row[name] is not None:
-            found.setdefault((row["frame"], row["robot"]), []).append(row[name])
-    return found

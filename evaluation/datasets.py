@@ -7,12 +7,13 @@ and its detections are shuffled, so that no method profits from the order in whi
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from ..matching import ObjectGraph, RelativePose
@@ -292,3 +293,19 @@ def _rows(values: Array | None, rows: NDArray[np.int64], shape: tuple[int, ...] 
     if values is None or np.isnan(values[rows]).any():
         return None
     return values[rows] if shape is None else values[rows].reshape(-1, *shape)
+
+
+Stored = dict[tuple[int, str], list[Any]]
+"""(frame, robot) -> values of a column, in stored order."""
+
+
+def optional_column(file: Path, name: str, frames: Sequence[int]) -> Stored:
+    """A column that matching has no use for, of some frames, without nulls; nothing if the file lacks it."""
+    if not frames or name not in pq.read_schema(file).names:
+        return {}
+    table = pq.read_table(file, columns=["frame", "robot", name], filters=[("frame", "in", list(frames))])
+    found: Stored = {}
+    for row in table.to_pylist():
+        if row[name] is not None:
+            found.setdefault((row["frame"], row["robot"]), []).append(row[name])
+    return found

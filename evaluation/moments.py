@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -10,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from ..fusion.metrics import displacement_errors
@@ -18,9 +16,10 @@ from ..fusion.objects import FusedObjects, Groups, fuse, group_detections, own_o
 from ..matching import Matching, ObjectGraph, RelativePose
 from ..matching.metrics import Counts, count, is_correct
 from ..matching.pose import Array, invert, transform
-from .datasets import Dataset, DatasetError, Frame, View, load_dataset, prior_between
+from .datasets import Dataset, DatasetError, Frame, Stored, View, load_dataset, optional_column, prior_between
 from .matching_run import match_pair
 from .methods import Method
+from .pictures import jpeg
 from .sequence import PairTrackers
 from .settings import MIN_DETECTIONS, Settings
 
@@ -153,7 +152,7 @@ def _scene_sightings(env: Any, views: Sequence[Any]) -> tuple[Sighting, ...]:
                 identity=names,
                 truth=places,
                 boxes=view.detections.boxes,
-                image=_encode(camera.rgb),
+                image=jpeg(camera.rgb),
                 size=(env.width, env.height),
                 pose=view.T_world_camera,
                 pose_covariance=view.pose_covariance,
@@ -216,41 +215,31 @@ def _match(
 class _Pictures:
     """Columns that matching has no use for, of some frames: (frame, robot) -> values in stored order."""
 
-    boxes: dict[tuple[int, str], list[Any]]
-    images: dict[tuple[int, str], list[Any]]
+    boxes: Stored
+    images: Stored
 
     @classmethod
     def read(cls, folder: Path, frames: list[int]) -> _Pictures:
         return cls(
-            _column(folder / "detections.parquet", "box", frames), _column(folder / "robots.parquet", "image", frames)
+            optional_column(folder / "detections.parquet", "box", frames),
+            optional_column(folder / "robots.parquet", "image", frames),
         )
 
     def sighting(self, frame: int, view: View) -> Sighting:
-        stored = self.boxes.get((frame, view.robot), [None])
+        stored = self.boxes.get((frame, view.robot), [])
+        whole = 0 < len(stored) == len(view.identity)
         return Sighting(
             robot=view.robot,
             graph=view.graph,
             identity=view.identity,
             truth=view.truth,
-            boxes=None if None in stored else np.asarray(stored, dtype=np.float64)[view.order].reshape(-1, 4),
+            boxes=np.asarray(stored, dtype=np.float64)[view.order].reshape(-1, 4) if whole else None,
             image=self.images.get((frame, view.robot), [None])[0],
             size=view.graph.image_size,
             pose=view.pose,
             pose_covariance=view.pose_covariance,
             pose_truth=view.pose_truth,
         )
-
-
-def _column(file: Path, name: str, frames: list[int]) -> dict[tuple[int, str], list[Any]]:
-    """An optional column; nothing where the file has none."""
-    if name not in pq.read_schema(file).names:
-        return {}
-    columns = ["frame", "robot", name]
-    table = pq.read_table(file, columns=columns, filters=[("frame", "in", frames)])
-    out: dict[tuple[int, str], list[Any]] = {}
-    for frame, robot, value in zip(*(table.column(c).to_pylist() for c in columns), strict=True):
-        out.setdefault((frame, robot), []).append(value)
-    return out
 
 
 def _things(sightings: Sequence[Sighting]) -> Things:
@@ -334,11 +323,3 @@ def _relative(source: Sighting, target: Sighting) -> RelativePose | None:
     assert source.pose_covariance is not None
     assert target.pose_covariance is not None
     return RelativePose.between(source.pose, source.pose_covariance, target.pose, target.pose_covariance)
-
-
-def _encode(rgb: NDArray[np.uint8]) -> bytes:
-    from PIL import Image
-
-    stream = io.BytesIO()
-    Image.fromarray(rgb).save(stream, "JPEG", quality=90)
-    return stream.getvalue()

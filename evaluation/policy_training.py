@@ -25,6 +25,7 @@ from ..agents.perception import make_perceptor
 from ..agents.wrapper import LocalizeWrapper
 from ..envs.scenes import parallel_env
 from .shards import write_atomically
+from .statistics import bootstrap_mean
 
 Controls = Callable[[ClaimObservations, dict[str, NDArray[np.float32]]], dict[str, NDArray[np.float32]]]
 """From the environment and its observations to the robots' controls."""
@@ -281,8 +282,8 @@ def _play(env: ClaimObservations, controller: Controls, seed: list[int]) -> dict
 def _row(name: str, played: list[dict[str, float]], policy: list[dict[str, float]]) -> dict[str, Any]:
     sums = {key: sum(p[key] for p in played) for key in played[0]}
     returns = np.array([p["return"] for p in played])
-    low, high = _interval(returns)
-    gain = (None, None) if played is policy else _interval(np.array([p["return"] for p in policy]) - returns)
+    low, high = bootstrap_mean(returns)
+    gain = (None, None) if played is policy else bootstrap_mean(np.array([p["return"] for p in policy]) - returns)
     return {
         "controller": name,
         "episodes": len(played),
@@ -295,11 +296,3 @@ def _row(name: str, played: list[dict[str, float]], policy: list[dict[str, float
         "scene_recall": sums["correct"] / sums["visible"] if sums["visible"] else 0.0,
         "collided": sums["collided"] / len(played),
     }
-
-
-def _interval(values: NDArray[np.float64], samples: int = 2000) -> tuple[float, float]:
-    """95 % bootstrap interval of the mean."""
-    rng = np.random.default_rng(0)
-    means = rng.choice(values, (samples, len(values))).mean(axis=1)
-    low, high = np.quantile(means, (0.025, 0.975))
-    return float(low), float(high)

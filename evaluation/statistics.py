@@ -6,7 +6,7 @@ from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..matching.metrics import Counts
 
@@ -33,6 +33,16 @@ def bootstrap_interval(
         return 0.0, 0.0
     f1 = _f1(_resamples(len(sums), samples, seed) @ np.array(list(sums.values())))
     low, high = np.quantile(f1, [(1 - level) / 2, (1 + level) / 2])
+    return float(low), float(high)
+
+
+def bootstrap_mean(
+    values: ArrayLike, samples: int = SAMPLES, level: float = LEVEL, seed: int = 0
+) -> tuple[float, float]:
+    """Percentile interval of the mean of one value per episode (n,)."""
+    x = np.asarray(values, dtype=np.float64)
+    means = _resamples(len(x), samples, seed) @ x / len(x)
+    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
     return float(low), float(high)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from covis.evaluation.statistics import bootstrap_f1, episode_sums, paired_difference
+from covis.evaluation.statistics import bootstrap_f1, bootstrap_mean, episode_sums, paired_difference
 from covis.matching.metrics import Counts
 
 
@@ -67,3 +67,13 @@ def test_equal_methods_do_not_differ():
 def test_episodes_must_be_the_same():
     with pytest.raises(ValueError, match="same episodes"):
         paired_difference(sums([1, 2]), sums([1]))
+
+
+def test_the_interval_of_a_mean_narrows_and_holds_it():
+    rng = np.random.default_rng(4)
+    few, many = rng.normal(3.0, 1.0, 10), rng.normal(3.0, 1.0, 1000)
+    for values in (few, many):
+        low, high = bootstrap_mean(values)
+        assert low < values.mean() < high
+        assert high - low == pytest.approx(4 * values.std() / np.sqrt(len(values)), rel=0.15)
+    assert bootstrap_mean([2.0, 2.0]) == (2.0, 2.0)
