@@ -128,4 +128,4 @@ def _print(row: dict[str, Any]) -> None:
     )
 
 
-_SHOWN = ("heat", "box", "mask", "classes", "depth", "centre", "embedding", "total")
+_SHOWN = ("heat", "box", "mask", "overlap", "classes", "depth", "centre", "embedding", "total")

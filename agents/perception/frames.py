@@ -60,7 +60,7 @@ class Variant:
 def training_variants(scenes: tuple[str, ...] = tuple(SCENES)) -> tuple[Variant, ...]:
     """What is trained on: every preset and map but those held out, `paper` most often, as the benchmark does."""
     share = {"easy": 1.0, "paper": 4.0, "hard": 1.0}
-    scene_weight = {"connected_driving": 1.4}
+    scene_weight = {"connected_driving": 2.2}
     maps: dict[str | None, float] = {"intersection": 5.0, "roundabout": 1.5, "highway": 1.0, "merge": 1.0}
     out = []
     for scene in scenes:
@@ -101,6 +101,8 @@ class Frame:
         identity: (m,) the same object has the same number in all frames of one snapshot.
         intrinsics: (3, 3).
         up: (3,) against gravity, camera frame.
+        camera_height_m: true height of the camera above the ground (the world's z = 0).
+        height_sigma_m: how well robots of this scene know it.
     """
 
     image: NDArray[np.uint8]
@@ -111,6 +113,8 @@ class Frame:
     identity: NDArray[np.int64]
     intrinsics: Array
     up: Array
+    camera_height_m: float
+    height_sigma_m: float
 
     def mirrored(self) -> Frame:
         """The frame of the mirrored world."""
@@ -135,6 +139,7 @@ def look(
     robot: int,
     horizontal_fov_rad: float,
     class_index: NDArray[np.int64],
+    height_sigma_m: float,
 ) -> Frame:
     """The frame of one robot's camera; `class_index` maps the world's classes to the joint ones."""
     K = intrinsics_from_fov(rasterizer.width, rasterizer.height, horizontal_fov_rad)
@@ -149,6 +154,8 @@ def look(
         identity=snapshot.identity,
         intrinsics=K,
         up=up_in_camera(T),
+        camera_height_m=float(T[2, 3]),
+        height_sigma_m=height_sigma_m,
     )
 
 
@@ -198,7 +205,8 @@ class FrameSource:
                 second = int(rng.integers(1, world.n_robots))
             stretch = math.exp(rng.uniform(-0.12, 0.12)) if rng.random() < 0.5 else 1.0
             fovs = [2 * math.atan(stretch * math.tan(0.5 * float(f))) for f in world.horizontal_fov_rad]
-            a, b = (look(rasterizer, snapshot, int(r), fovs[int(r)], class_index) for r in (first, second))
+            sigma = SCENES[variant.scene].pose_noise.position_m
+            a, b = (look(rasterizer, snapshot, int(r), fovs[int(r)], class_index, sigma) for r in (first, second))
             yield a, b
             for _ in range(int(rng.integers(2, 5))):
                 world.step(_wandering(world, rng))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -150,21 +151,22 @@ class LearnedPerception:
         """Like calling, with all there is to know."""
         clock = Clock()
         image = self._checked(observation)
-        height, width = image.shape[:2]
+        rows, columns = image.shape[:2]
         K = np.asarray(observation["intrinsics"], dtype=np.float64)
         up = np.asarray(observation["up"], dtype=np.float64)
-        geometry = Geometry.of(torch.from_numpy(K[None]), torch.from_numpy(up[None]))
+        height, height_std = (torch.tensor([value]) for value in camera_height(observation))
+        geometry = Geometry.of(torch.from_numpy(K[None]), torch.from_numpy(up[None]), height, height_std)
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
 
         dense = self.network(normalised(torch.from_numpy(image[None])), geometry)
         clock.lap("backbone")
-        found = self._find(dense, geometry, height, width)
+        found = self._find(dense, geometry, rows, columns)
         clock.lap("masks")
         attributes, v = self._classify(found.features, generator)
         clock.lap("classes")
         depth, variance, epistemic = self._depths(dense, geometry, found, generator)
         clock.lap("depth")
-        graph = self._graph(found, attributes, v, depth, variance, K, up, (width, height))
+        graph = self._graph(found, attributes, v, depth, variance, K, up, (columns, rows))
         clock.lap("graph")
         detections = Detections(graph, found.tight, found.masks)
         return Seen(detections, found.scores, found.pixels, depth, variance, epistemic, clock.laps)
@@ -185,7 +187,7 @@ class LearnedPerception:
     def _find(self, dense: DenseFeatures, geometry: Geometry, height: int, width: int) -> _Found:
         """Objects with their masks, the better of two claims to one thing kept."""
         p = self.params
-        cells, peak = find_peaks(torch.sigmoid(dense.heat[0]).numpy(), 0.5 * p.score)
+        cells, peak = find_peaks(torch.sigmoid(dense.heat[0]).numpy(), p.score**3)
         best = np.argsort(-peak, kind="stable")[: p.candidates]
         cells, peak = cells[best], peak[best]
         at = torch.from_numpy((FINE_STRIDE * (cells[:, ::-1] + 0.5)).astype(np.float32))
@@ -205,7 +207,8 @@ class LearnedPerception:
             FINE_STRIDE,
         )
         covered, quality = mask_quality(logits, region)
-        scores = np.sqrt(peak.astype(np.float64) * quality)
+        overlap = torch.sigmoid(out.overlap).double().numpy()
+        scores = np.cbrt(peak * quality * overlap)
         keep = suppress(logits, region, covered, scores, p.max_iou, p.max_inside)
         keep = keep[scores[keep] >= p.score]
         masks, pixels, tight = full_masks(logits[keep], region[keep], height, width)
@@ -327,6 +330,25 @@ def graph_of(
         intrinsics=intrinsics,
         image_size=image_size,
     )
+
+
+def camera_height(observation: Mapping[str, Any]) -> tuple[float, float]:
+    """Height of a robot's camera above the ground, m, and its deviation, by its own noisy pose; infinite without one.
+
+    The ground is z = 0 of the world.
+
+    Raises:
+        ValueError: a pose or covariance of another shape, or not finite.
+    """
+    if "pose" not in observation:
+        return 0.0, math.inf
+    pose = np.asarray(observation["pose"], dtype=np.float64)
+    covariance = np.asarray(observation.get("pose_covariance", np.zeros((6, 6))), dtype=np.float64)
+    for name, value, shape in (("pose", pose, (4, 4)), ("pose_covariance", covariance, (6, 6))):
+        if value.shape != shape or not np.isfinite(value).all():
+            raise ValueError(f"{name} must be finite and of shape {shape}, got shape {value.shape}: {value.tolist()}")
+    up = pose[2, :3]  # right perturbation: the covariance is in the camera frame
+    return float(pose[2, 3]), math.sqrt(max(float(up @ covariance[:3, :3] @ up), 0.0))
 
 
 @dataclass(frozen=True, eq=False)

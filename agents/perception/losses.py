@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -35,6 +36,8 @@ DEPTH_POINTS = 8
 MIN_PIXELS = 40
 """Objects with fewer visible pixels are neither wanted nor forbidden."""
 MIN_DEPTH_M = 0.2
+NO_HEIGHT = 0.1
+"""Share of images whose camera's height is withheld."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +47,7 @@ class Batch:
     Attributes:
         images: (b, H, W, 3) uint8.
         intrinsics, up: (b, 3, 3), (b, 3).
+        height, height_std: (b,) m, of the cameras as the robots report it, and 1 sigma.
         heat, heat_weight: (b, H/2, W/2).
         image: (k,) index of each object's image.
         pair: (k,) number of each object's pair of images; side (k,) 0 or 1 in it.
@@ -61,6 +65,8 @@ class Batch:
     images: Tensor
     intrinsics: Tensor
     up: Tensor
+    height: Tensor
+    height_std: Tensor
     heat: Tensor
     heat_weight: Tensor
     image: Tensor
@@ -80,7 +86,7 @@ class Batch:
 
     @property
     def geometry(self) -> Geometry:
-        return Geometry.of(self.intrinsics, self.up)
+        return Geometry.of(self.intrinsics, self.up, self.height, self.height_std)
 
 
 def make_batch(
@@ -101,10 +107,13 @@ def make_batch(
             for name, number in (("image", i), ("pair", i // 2), ("side", i % 2), ("identity", frame.identity[obj])):
                 rows[name].append(np.asarray(number, np.int64))
     images = np.stack([frame.image for frame in frames])
+    heights = np.array([_reported_height(frame, rng) for frame in frames], np.float32)
     return Batch(
         images=torch.from_numpy(vary(images, rng) if augment else images),
         intrinsics=torch.from_numpy(np.stack([f.intrinsics for f in frames])).float(),
         up=torch.from_numpy(np.stack([f.up for f in frames])).float(),
+        height=torch.from_numpy(heights[:, 0]),
+        height_std=torch.from_numpy(heights[:, 1]),
         heat=torch.from_numpy(heat),
         heat_weight=torch.from_numpy(weight),
         masks=torch.from_numpy(_masks(frames)) if masks else None,
@@ -116,6 +125,14 @@ def _masks(frames: Sequence[Frame]) -> NDArray[np.uint8]:
     height, width = frames[0].instances.shape
     found = [f.instances == obj for f in frames for obj in np.flatnonzero(f.objects.pixels >= MIN_PIXELS)]
     return np.array(found, np.uint8).reshape(-1, height, width)
+
+
+def _reported_height(frame: Frame, rng: np.random.Generator) -> tuple[float, float]:
+    """Height of a camera as a robot with a worse or better receiver would report it, with 1 sigma; some have none."""
+    sigma = frame.height_sigma_m * math.exp(rng.normal(0, 0.3))
+    if rng.random() < NO_HEIGHT:
+        return 0.0, math.inf
+    return frame.camera_height_m + rng.normal(0, sigma), sigma
 
 
 _PER_OBJECT: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
@@ -195,6 +212,7 @@ class LossWeights:
     heat: float = 1.0
     box: float = 1.0
     mask: float = 2.0
+    overlap: float = 0.3
     classes: float = 1.0
     depth: float = 1.0
     centre: float = 0.3
@@ -255,6 +273,7 @@ def _object_losses(
     return {
         "box": box_loss,
         "mask": mask_loss(mask, batch.mask_labels),
+        "overlap": overlap_loss(out.overlap[which], mask.detach(), batch.mask_labels),
         "classes": F.cross_entropy(logits, repeated),
         "depth": gaussian_loss(error, log_variance.view(k, DEPTH_POINTS), batch.located[:, None]),
         "centre": gaussian_loss(
@@ -280,6 +299,17 @@ def mask_loss(logits: Tensor, labels: Tensor) -> Tensor:
     p = torch.sigmoid(logits)
     dice = 1 - (2 * (p * labels).sum(1) + 1) / ((p * p).sum(1) + labels.sum(1) + 1)
     return F.binary_cross_entropy_with_logits(logits, labels) + dice.mean()
+
+
+def gaussian_loss(error: Tensor, log_variance: Tensor, valid: Tensor) -> Tensor:
+
+
+def overlap_loss(overlap: Tensor, logits: Tensor, labels: Tensor) -> Tensor:
+    """Cross entropy of the expected IoU (k,) with that at those of the points (k, s) that are spread evenly."""
+    even = slice(0, labels.shape[1] // 2)  # see `targets.points_around`
+    found, true = logits[:, even] > 0, labels[:, even] > 0.5
+    iou = ((found & true).sum(1) + 0.5) / ((found | true).sum(1) + 0.5)
+    return F.binary_cross_entropy_with_logits(overlap, iou)
 
 
 def gaussian_loss(error: Tensor, log_variance: Tensor, valid: Tensor) -> Tensor:

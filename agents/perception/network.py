@@ -1,7 +1,8 @@
 """The network behind the learned eyes: one backbone pass per image, then small heads on the objects' cells alone.
 
-A residual backbone (strides 2 to 32) and a light feature pyramid give features at stride 4. From them come a heat map
-of visible centres at stride 2 (by pixel shuffle), and mask features at stride 2. At each centre a small head gives
+A residual backbone (strides 2 to 32) and a light feature pyramid give features at strides 4, 8 and 16. From the finest
+come a heat map of visible centres at stride 2 (by pixel shuffle), and mask features at stride 2. At each centre a small
+head, which reads all three (fine ones for small objects in a crowd, coarse ones for what is near and cut up), gives
 class, box, place of the projected 3-D centre, appearance, and the weights of that object's own mask head (dynamic
 masks, since grouping pixels by predicted offsets was the bottleneck of earlier trials). At pixels of each object
 another small head gives the depth of the object's centre and its log-variance.
@@ -21,13 +22,15 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-STRIDE = 4
+STRIDES = (4, 8, 16)
 """Of the features that the heads read."""
 FINE_STRIDE = 2
 """Of heat map and masks."""
 GEOMETRY_CHANNELS = 4
 REFERENCE_FOCAL_PX = 200.0
-OBJECT_GEOMETRY = 10
+CENTRE_GEOMETRY = 3
+OBJECT_GEOMETRY = 14
+LOWEST_CAMERA_M = 0.05
 
 
 @dataclass(frozen=True)
@@ -41,22 +44,22 @@ class NetworkParams:
         neck: channels of the pyramid.
         mask_channels: features at stride 2 that mask heads read.
         mask_hidden: width of each object's own mask head.
-        head: width of the heads on cells.
+        head: width of the class and depth heads; the head of boxes and masks is twice as wide.
         embedding: length of the appearance vector.
         dropout: rate in the class head.
         depth_dropout: rate in the depth head.
     """
 
     classes: tuple[str, ...]
-    widths: tuple[int, ...] = (16, 32, 64, 128, 160)
-    blocks: tuple[int, ...] = (1, 2, 2, 1)
-    neck: int = 48
-    mask_channels: int = 12
+    widths: tuple[int, ...] = (16, 32, 64, 128, 192)
+    blocks: tuple[int, ...] = (1, 2, 3, 2)
+    neck: int = 64
+    mask_channels: int = 16
     mask_hidden: int = 8
     head: int = 128
     embedding: int = 32
     dropout: float = 0.3
-    depth_dropout: float = 0.2
+    depth_dropout: float = 0.3
 
     def __post_init__(self) -> None:
         if not self.classes or len(set(self.classes)) != len(self.classes):
@@ -88,12 +91,12 @@ class DenseFeatures:
 
     Attributes:
         heat: (b, H/2, W/2) logits: is the visible centre of an object here?
-        cells: (b, H/4, W/4, c) features of the heads.
+        cells: (b, H/4, W/4, c), (b, H/8, W/8, c) and (b, H/16, W/16, c) features of the heads.
         mask: (b, H/2, W/2, m) features of the mask heads.
     """
 
     heat: Tensor
-    cells: Tensor
+    cells: tuple[Tensor, ...]
     mask: Tensor
 
 
@@ -105,17 +108,21 @@ class Geometry:
         focal: (b,) px.
         centre: (b, 2) principal point, px.
         up: (b, 3) unit vector against gravity, camera frame.
+        height: (b,) m above the ground, as the robot's own pose says.
+        height_std: (b,) m, 1 sigma of that; infinite where nothing is known.
     """
 
     focal: Tensor
     centre: Tensor
     up: Tensor
+    height: Tensor
+    height_std: Tensor
 
     @classmethod
-    def of(cls, intrinsics: Tensor, up: Tensor) -> Geometry:
-        """From intrinsics (b, 3, 3) and up (b, 3)."""
+    def of(cls, intrinsics: Tensor, up: Tensor, height: Tensor, height_std: Tensor) -> Geometry:
+        """From intrinsics (b, 3, 3), up (b, 3), height (b,) and its deviation (b,)."""
         focal = 0.5 * (intrinsics[:, 0, 0] + intrinsics[:, 1, 1])
-        return cls(focal.float(), intrinsics[:, :2, 2].float(), up.float())
+        return cls(focal.float(), intrinsics[:, :2, 2].float(), up.float(), height.float(), height_std.float())
 
     def rays(self, image: Tensor, pixels: Tensor) -> Tensor:
         """Directions (k, 3) with unit z of pixels (k, 2) of images (k,)."""
@@ -125,6 +132,11 @@ class Geometry:
     def elevation(self, image: Tensor, rays: Tensor) -> Tensor:
         """Sine of the angle (k,) of rays (k, 3) above the horizon."""
         return (rays * self.up[image]).sum(1) / rays.norm(dim=1)
+
+    def log_height(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Log of the height (k,), and how far it can be trusted (k,), from 0 (unknown) to 1 (exact)."""
+        height = self.height[image].clamp(min=LOWEST_CAMERA_M)
+        return torch.log(height), 1 / (1 + (self.height_std[image] / height) ** 2)
 
     def maps(self, height: int, width: int) -> Tensor:
         """Channels (b, 4, height, width): ray x and y, sine of elevation, log focal length."""
@@ -147,6 +159,7 @@ class ObjectOutputs:
         box: (k, 4) log of the distances from the centre to the box's left, top, right, bottom edge, px / 16.
         centre: (k, 2) from the visible to the projected 3-D centre, in units of the box's size.
         centre_log_variance: (k,) of that, per axis.
+        overlap: (k,) logit of the IoU that the mask is expected to have with the object.
         mask: (k, NetworkParams.mask_weights).
         embedding: (k, e) unit vectors.
     """
@@ -154,6 +167,7 @@ class ObjectOutputs:
     box: Tensor
     centre: Tensor
     centre_log_variance: Tensor
+    overlap: Tensor
     mask: Tensor
     embedding: Tensor
 
@@ -173,16 +187,16 @@ class Eyes(nn.Module):
         self.context = nn.Linear(w[4], w[4])
         self.lateral = nn.ModuleList(nn.Conv2d(n, c, 1) for n in w[1:])
         self.smooth = nn.ModuleList(_conv(c, c) for _ in range(2))
-        self.to_heat = nn.Sequential(_conv(c, 24), nn.Conv2d(24, FINE_STRIDE**2, 1))
+        self.to_heat = nn.Sequential(_conv(c, 32), nn.Conv2d(32, FINE_STRIDE**2, 1))
         self.to_fine = nn.Conv2d(c, FINE_STRIDE**2 * params.mask_channels, 1)
         self.from_stem = nn.Conv2d(w[0], params.mask_channels, 1)
         self.mask_mix = nn.Sequential(_conv(params.mask_channels, 16), nn.Conv2d(16, params.mask_channels, 1))
-        n_in = c + 3
-        self.object_in = nn.Linear(n_in, params.head)
-        self.object_out = nn.Linear(params.head, 4 + 3 + params.mask_weights + params.embedding)
+        n_in = len(STRIDES) * c + CENTRE_GEOMETRY
+        self.object_in = nn.Linear(n_in, 2 * params.head)
+        self.object_out = nn.Linear(2 * params.head, 4 + 4 + params.mask_weights + params.embedding)
         self.class_in = nn.Linear(n_in, params.head)
         self.class_out = nn.Linear(params.head, len(params.classes))
-        self.depth_in = nn.Linear(c + OBJECT_GEOMETRY, params.head)
+        self.depth_in = nn.Linear(len(STRIDES) * c + OBJECT_GEOMETRY, params.head)
         self.depth_mid = nn.Linear(params.head, params.head)
         self.depth_out = nn.Linear(params.head, 2)
         self._initialise()
@@ -209,23 +223,25 @@ class Eyes(nn.Module):
             levels.append(y)
         levels[3] = levels[3] + self.context(levels[3].mean((2, 3)))[:, :, None, None]
         top = self.lateral[3](levels[3])
-        top = self.lateral[2](levels[2]) + _twice(top, levels[2])
-        top = self.smooth[0](self.lateral[1](levels[1]) + _twice(top, levels[1]))
-        cells = self.smooth[1](self.lateral[0](levels[0]) + _twice(top, levels[0]))
+        coarse = self.lateral[2](levels[2]) + _twice(top, levels[2])
+        middle = self.smooth[0](self.lateral[1](levels[1]) + _twice(coarse, levels[1]))
+        cells = self.smooth[1](self.lateral[0](levels[0]) + _twice(middle, levels[0]))
         heat = F.pixel_shuffle(self.to_heat(cells), FINE_STRIDE)[:, 0]
         mask = self.mask_mix(F.relu(F.pixel_shuffle(self.to_fine(cells), FINE_STRIDE) + self.from_stem(stem)))
-        return DenseFeatures(heat.float(), cells.permute(0, 2, 3, 1).float(), mask.permute(0, 2, 3, 1).float())
+        read = tuple(level.permute(0, 2, 3, 1).float() for level in (cells, middle, coarse))
+        return DenseFeatures(heat.float(), read, mask.permute(0, 2, 3, 1).float())
 
     def objects(self, found: Tensor) -> ObjectOutputs:
-        """Of centre features (k, c + 3), see `centre_features`."""
+        """Of centre features (k, 3 c + CENTRE_GEOMETRY), see `centre_features`."""
         out = self.object_out(F.relu(self.object_in(found)))
-        box, centre, log_variance, mask, embedding = out.split(
-            [4, 2, 1, self.params.mask_weights, self.params.embedding], dim=1
+        box, centre, log_variance, overlap, mask, embedding = out.split(
+            [4, 2, 1, 1, self.params.mask_weights, self.params.embedding], dim=1
         )
-        return ObjectOutputs(box, centre, log_variance[:, 0].clamp(-10, 2), mask, F.normalize(embedding, dim=1))
+        embedding = F.normalize(embedding, dim=1)
+        return ObjectOutputs(box, centre, log_variance[:, 0].clamp(-10, 2), overlap[:, 0], mask, embedding)
 
     def class_logits(self, found: Tensor, sample: bool, generator: torch.Generator | None = None) -> Tensor:
-        """Logits (..., classes) of centre features (..., c + 3); with `sample` a draw from the dropout posterior."""
+        """Logits (..., classes) of centre features; with `sample` a draw from the dropout posterior."""
         p = self.params.dropout if sample else 0.0
         hidden = F.relu(self.class_in(dropout(found, p / 2, generator)))
         return self.class_out(dropout(hidden, p, generator))
@@ -235,7 +251,7 @@ class Eyes(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Log depth of the object's centre over focal length, and log-variance of it, (draws, k) each.
 
-        `seen` (k, c + OBJECT_GEOMETRY) as `depth_features` makes it; with `sample` every draw is one from the dropout
+        `seen` (k, 3 c + OBJECT_GEOMETRY) as `depth_features` makes it; with `sample` every draw is one from the dropout
         posterior. The first layer is before all dropout and computed once.
         """
         p = self.params.depth_dropout if sample else 0.0
@@ -250,24 +266,31 @@ class Eyes(nn.Module):
 
 
 def centre_features(dense: DenseFeatures, geometry: Geometry, image: Tensor, pixels: Tensor) -> Tensor:
-    """Input (k, c + 3) of the heads at centres: features there, elevation and ray."""
+    """Input (k, 3 c + CENTRE_GEOMETRY) of the heads at centres: features there, elevation and ray."""
     rays = geometry.rays(image, pixels)
     geometric = torch.stack([4 * geometry.elevation(image, rays), rays[:, 0], rays[:, 1]], dim=1)
-    return torch.cat([bilinear(dense.cells, image, pixels, STRIDE), geometric], dim=1)
+    return torch.cat([*_features_at(dense, image, pixels), geometric], dim=1)
+
+
+def _features_at(dense: DenseFeatures, image: Tensor, pixels: Tensor) -> list[Tensor]:
+    return [bilinear(cells, image, pixels, stride) for cells, stride in zip(dense.cells, STRIDES, strict=True)]
 
 
 def depth_features(dense: DenseFeatures, geometry: Geometry, image: Tensor, pixels: Tensor, box: Tensor) -> Tensor:
-    """Input (k, c + OBJECT_GEOMETRY) of the depth head at pixels (k, 2) of objects with boxes (k, 4) px.
+    """Input (k, 3 c + OBJECT_GEOMETRY) of the depth head at pixels (k, 2) of objects with boxes (k, 4) px.
 
     With the features go what a surveyor would use: where the box ends against the horizon (a body on the ground is as
-    far as its foot is low) and how large it looks.
+    far as its foot is low, in units of the camera's height) and how large it looks.
     """
     focal = geometry.focal[image]
+    log_focal = torch.log(focal / REFERENCE_FOCAL_PX)
+    log_height, trust = geometry.log_height(image)
     rays = geometry.rays(image, pixels)
     size = (box[:, 2:] - box[:, :2]).clamp(min=1.0)
     middle = 0.5 * (box[:, 0] + box[:, 2])
     foot = geometry.elevation(image, geometry.rays(image, torch.stack([middle, box[:, 3]], dim=1)))
     head = geometry.elevation(image, geometry.rays(image, torch.stack([middle, box[:, 1]], dim=1)))
+    log_foot = torch.log(foot.abs().clamp(min=0.01))
     place = (pixels - box[:, :2]) / size
     geometric = torch.stack(
         [
@@ -276,7 +299,11 @@ def depth_features(dense: DenseFeatures, geometry: Geometry, image: Tensor, pixe
             rays[:, 1],
             4 * foot,
             4 * head,
-            torch.log(foot.abs().clamp(min=0.01)),
+            log_foot,
+            log_focal,
+            trust,
+            trust * log_height,
+            trust * (log_height - log_foot - log_focal),  # a foot on level ground, in units of the answer
             torch.log(size[:, 0] / focal),
             torch.log(size[:, 1] / focal),
             place[:, 0].clamp(-1, 2),
@@ -284,7 +311,7 @@ def depth_features(dense: DenseFeatures, geometry: Geometry, image: Tensor, pixe
         ],
         dim=1,
     )
-    return torch.cat([bilinear(dense.cells, image, pixels, STRIDE), geometric], dim=1)
+    return torch.cat([*_features_at(dense, image, pixels), geometric], dim=1)
 
 
 def boxes_from(log_edges: Tensor, pixels: Tensor) -> Tensor:

@@ -63,14 +63,14 @@ class TrainingParams:
     workers: int = 1
     meet_every: int = 16
     pool_chunks: int = 60
-    steps_per_chunk: int = 2
+    steps_per_chunk: int = 3
     learning_rate: float = 1.5e-3
     warm_up: float = 0.04
     weight_decay: float = 0.02
     average: float = 0.998
     bf16: bool = True
     checkpoint_s: float = 60.0
-    validate_s: float = 300.0
+    validate_s: float = 600.0
     weights: LossWeights = field(default_factory=LossWeights)
     variants: tuple[Variant, ...] = field(default_factory=training_variants)
     network: str = "compact"

@@ -14,7 +14,7 @@ import numpy as np
 
 TENSORS = "eyes.safetensors"
 MANIFEST = "eyes.json"
-FORMAT, VERSION = "covis-eyes", 1
+FORMAT, VERSION = "covis-eyes", 2
 SHIPPED = Path(__file__).parent / "weights"
 """The folder of the weights that come with the package."""
 

@@ -223,7 +223,7 @@ def test_bilinear_equals_grid_sample():
 def test_geometry_maps_agree_with_rays():
     K = torch.tensor([[[90.0, 0, 30], [0, 90.0, 25], [0, 0, 1]]])
     up = torch.nn.functional.normalize(torch.tensor([[0.1, -1.0, 0.2]]))
-    geometry = Geometry.of(K, up)
+    geometry = Geometry.of(K, up, torch.tensor([1.0]), torch.tensor([0.1]))
     maps = geometry.maps(50, 60)
     pixels = torch.tensor([[10.5, 20.5], [59.5, 0.5]])
     image = torch.zeros(2, dtype=torch.int64)
@@ -310,10 +310,13 @@ def test_folding_the_normalisation_changes_nothing():
     plain.load_state_dict(tiny_weights().tensors)
     plain.eval()
     seen = observation()
-    geometry = Geometry.of(torch.from_numpy(seen["intrinsics"][None]), torch.from_numpy(seen["up"][None]))
+    height, height_std = torch.tensor([1.0]), torch.tensor([0.1])
+    geometry = Geometry.of(
+        torch.from_numpy(seen["intrinsics"][None]), torch.from_numpy(seen["up"][None]), height, height_std
+    )
     with torch.inference_mode():
         x = normalised(torch.from_numpy(seen["image"][None]))
-        torch.testing.assert_close(look.network(x, geometry).cells, plain(x, geometry).cells, atol=1e-4, rtol=1e-4)
+        torch.testing.assert_close(look.network(x, geometry).mask, plain(x, geometry).mask, atol=1e-4, rtol=1e-4)
 
 
 def test_an_image_without_objects_gives_an_empty_graph():
