@@ -301,9 +301,6 @@ def mask_loss(logits: Tensor, labels: Tensor) -> Tensor:
     return F.binary_cross_entropy_with_logits(logits, labels) + dice.mean()
 
 
-def gaussian_loss(error: Tensor, log_variance: Tensor, valid: Tensor) -> Tensor:
-
-
 def overlap_loss(overlap: Tensor, logits: Tensor, labels: Tensor) -> Tensor:
     """Cross entropy of the expected IoU (k,) with that at those of the points (k, s) that are spread evenly."""
     even = slice(0, labels.shape[1] // 2)  # see `targets.points_around`

@@ -56,7 +56,7 @@ def tiny_weights(seed: int = 0, params: NetworkParams = TINY) -> stored.Weights:
         torch.nn.init.constant_(last.bias, 0.0)
         torch.nn.init.normal_(network.object_out.weight, std=0.1)
         with torch.no_grad():
-            network.object_out.bias[6 + params.mask_weights] = 1.0  # the last number of the mask heads: all inside
+            network.object_out.bias[7 + params.mask_weights] = 1.0  # the last number of the mask heads: all inside
     return stored.Weights(network.state_dict(), params.to_dict())
 
 

@@ -132,6 +132,8 @@ def test_a_batch_without_objects_still_trains(pairs):
         identity=np.zeros(0, np.int64),
         intrinsics=frame.intrinsics,
         up=frame.up,
+        camera_height_m=1.0,
+        height_sigma_m=0.1,
     )
     parts = losses(Eyes(tiny()), make_batch([(empty, empty)], np.random.default_rng(0)), LossWeights(), None)
     assert set(parts) == {"heat", "total"}
