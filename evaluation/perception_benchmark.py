@@ -97,6 +97,7 @@ class Tally:
         u, v: (k,) reported uncertainties; across (k,) m^2, reported variance per axis across the viewing ray.
         attributes, true_class: (k, c), (k,).
         size: (k,) visible pixels.
+        known: (k, 6) `variance_features` of the reported variances.
         milliseconds: per image.
     """
 
@@ -116,6 +117,7 @@ class Tally:
     attributes: list[Array] = field(default_factory=list)
     true_class: list[NDArray[np.int64]] = field(default_factory=list)
     size: list[Array] = field(default_factory=list)
+    known: list[Array] = field(default_factory=list)
     milliseconds: list[float] = field(default_factory=list)
     coco: CocoRecords = field(default_factory=lambda: CocoRecords())
 
@@ -307,7 +309,18 @@ def count(out: Tally, image: Image, seen: Seen, score: float) -> None:
     out.across.append(0.5 * (np.trace(covariances, axis1=1, axis2=2) - graph.position_variance))
     out.attributes.append(graph.attributes)
     out.true_class.append(image.object_class[true])
+    out.known.append(_known(seen, found, graph.intrinsics[0, 0]))
     out.size.append(image.pixels[true].astype(np.float64))
+
+
+def _known(seen: Seen, found: NDArray[np.int64], focal: float) -> Array:
+    from ..agents.perception.weights import variance_features
+
+    variance, depth = seen.depth_variance[found], seen.depth[found]
+    share = seen.depth_epistemic[found] / variance
+    return variance_features(
+        variance / depth**2, share, seen.scores[found], seen.pixels[found], np.full(len(found), focal)
+    )
 
 
 def match_masks(masks: NDArray[np.bool_], instances: NDArray[np.int32], pixels: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -339,6 +352,7 @@ def row(target: PerceptionTarget, found: Tally) -> dict[str, Any]:
         "depth_abs_rel": _mean(np.abs(found.of("depth_ratio") - 1)),
         "depth_bias": _mean(found.of("depth_ratio") - 1),
         "depth_spearman": spearman(u, squared),
+        "depth_spearman_exact": exact_spearman(u),
         "depth_only_spearman": spearman(found.of("distance"), squared),
         "ence": ence(u, squared),
         "u_mean_m2": _mean(u),
@@ -354,6 +368,16 @@ def spearman(a: Array, b: Array) -> float | None:
     if len(a) < 3 or np.ptp(a) == 0 or np.ptp(b) == 0:
         return None
     return float(spearmanr(a, b).statistic)
+
+
+def exact_spearman(variance: Array, draws: int = 20) -> float | None:
+    """What `spearman` of these variances would be if errors were Gaussian with exactly them: the most to be hoped for.
+
+    It is small where all variances are about the same, however true they are.
+    """
+    rng = np.random.default_rng(0)
+    found = [spearman(variance, variance * rng.chisquare(1, len(variance))) for _ in range(draws)]
+    return None if found[0] is None else float(np.mean([f for f in found if f is not None]))
 
 
 def ence(variance: Array, squared_error: Array, bins: int = ENCE_BINS) -> float | None:
@@ -472,6 +496,7 @@ def table_columns() -> Iterable[tuple[str, str]]:
         ("class_accuracy", "class"),
         ("depth_abs_rel", "AbsRel"),
         ("depth_spearman", "rho(u)"),
+        ("depth_spearman_exact", "rho exact"),
         ("depth_only_spearman", "rho(z)"),
         ("ence", "ENCE"),
         ("u_ratio_matched", "u ratio"),

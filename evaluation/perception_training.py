@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.optimize import minimize
 
 from ..matching.pose import Array
-from .perception_benchmark import PerceptionTarget, Tally, default_targets, ence, row, tally
+from .perception_benchmark import PerceptionTarget, Tally, default_targets, row, tally
 
 if TYPE_CHECKING:
     from torch import nn
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 FIGURES = ("ap50", "class_accuracy", "depth_abs_rel", "depth_spearman", "ence")
 MEDIAN_CHI_SQUARED_2 = 2 * np.log(2)
 SMALLEST_TALLY = 30
+RIDGE = 0.003
 
 
 def known_targets() -> list[PerceptionTarget]:
@@ -64,32 +66,52 @@ def training_notes(state: State, params: TrainingParams) -> dict[str, Any]:
 
 
 def calibrate(tallies: Sequence[Tally]) -> Calibration:
-    """Factors on depth and variances, and the class temperature, that fit what uncalibrated eyes saw.
+    """Factor on the depth, correction of its variance, class temperature: what fits that which uncalibrated eyes saw.
 
-    Scenes count alike. The factor on the depth makes the median of its logarithmic error zero; that on its variance has
-    the least expected normalised calibration error; that on the centre's makes the median of the squared lateral error
-    that of two Gaussian axes; the temperature has the least negative log-likelihood of the true classes. Scenes with
-    too few detections are left out.
+    Scenes count alike. The factor on the depth makes the median of its logarithmic error zero; the correction of its
+    variance makes the errors most likely, see `_variance_correction`; the factor on the centre's variance makes the
+    median of the squared lateral error that of two Gaussian axes; the temperature has the least negative log-likelihood
+    of the true classes. Scenes with too few detections are left out.
     """
     from ..agents.perception.weights import Calibration
 
     used = [t for t in tallies if len(t.of("u")) >= SMALLEST_TALLY]
     if not used:
         return Calibration()
-    factors = np.exp(np.linspace(np.log(0.05), np.log(20), 121))
     scale = float(np.exp(-np.mean([np.median(np.log(t.of("depth_ratio"))) for t in used])))
     squared = [(scale * t.of("distance") - t.of("true_distance")) ** 2 for t in used]
-    reported = [scale**2 * t.of("u") for t in used]
-    errors = [np.mean([ence(f * u, e) or 0.0 for u, e in zip(reported, squared, strict=True)]) for f in factors]
+    ratios = [e / (scale**2 * t.of("u")) for t, e in zip(used, squared, strict=True)]
     lateral = [np.median(t.of("lateral") ** 2 / t.of("across")) / MEDIAN_CHI_SQUARED_2 for t in used]
     temperatures = np.exp(np.linspace(np.log(0.3), np.log(3), 61))
     surprise = [np.mean([_negative_log_likelihood(t, x) for t in used]) for x in temperatures]
     return Calibration(
         scale=scale,
-        depth=float(factors[int(np.argmin(errors))]),
+        depth=_variance_correction([t.of("known") for t in used], ratios),
         centre=float(np.exp(np.mean(np.log(lateral)))),
         class_temperature=float(temperatures[int(np.argmin(surprise))]),
     )
+
+
+def _variance_correction(known: Sequence[Array], ratios: Sequence[Array]) -> tuple[float, ...]:
+    """Coefficients of the log of the factor on the variance that make the errors of all scenes together most likely.
+
+    Args:
+        known: (k, 6) features of each scene's detections.
+        ratios: (k,) squared errors over reported variances.
+    """
+    features, ratio = np.concatenate(known), np.concatenate(ratios)
+    weight = np.concatenate([np.full(len(r), 1 / (len(r) * len(ratios))) for r in ratios])
+
+    def cost(theta: Array) -> tuple[float, Array]:
+        log_factor = np.clip(features @ theta, -20, 20)
+        surprise = ratio * np.exp(-log_factor)
+        value = weight @ (log_factor + surprise) + RIDGE * (theta[1:] ** 2).sum()
+        slope = features.T @ (weight * (1 - surprise))
+        slope[1:] += 2 * RIDGE * theta[1:]
+        return float(value), slope
+
+    found = minimize(cost, np.zeros(features.shape[1]), jac=True, method="BFGS")
+    return tuple(float(x) for x in found.x)
 
 
 def _negative_log_likelihood(found: Tally, temperature: float) -> float:

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from ...matching.pose import Array
+
 TENSORS = "eyes.safetensors"
 MANIFEST = "eyes.json"
 FORMAT, VERSION = "covis-eyes", 2
@@ -23,26 +25,59 @@ class WeightsError(RuntimeError):
     """Weights that are missing, altered or of another format; the message names the file."""
 
 
+VARIANCE_FEATURES = ("constant", "variance", "epistemic", "confidence", "pixels", "focal")
+"""Of what the correction of a depth's variance is a linear function, see `variance_features`."""
+
+
 @dataclass(frozen=True)
 class Calibration:
-    """Factors, found on validation seeds, that make depths unbiased and the reported uncertainty true.
+    """What makes depths unbiased and the reported uncertainty true, found on validation seeds.
 
     Attributes:
-        scale: on the depth itself.
-        depth: on the variance of the depth.
-        centre: on the variance of the projected centre.
+        scale: factor on the depth itself.
+        depth: coefficients, one per `VARIANCE_FEATURES`, of the log of the factor on its variance.
+        centre: factor on the variance of the projected centre.
         class_temperature: logits are divided by it.
     """
 
     scale: float = 1.0
-    depth: float = 1.0
+    depth: tuple[float, ...] = (0.0,) * len(VARIANCE_FEATURES)
     centre: float = 1.0
     class_temperature: float = 1.0
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
+        for name in ("scale", "centre", "class_temperature"):
+            value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
                 raise ValueError(f"Calibration.{name} must be positive, got {value}")
+        object.__setattr__(self, "depth", tuple(self.depth))
+        if len(self.depth) != len(VARIANCE_FEATURES) or not np.isfinite(self.depth).all():
+            raise ValueError(f"Calibration.depth must be {len(VARIANCE_FEATURES)} finite numbers, got {self.depth}")
+
+    def variance_factor(self, features: Array) -> Array:
+        """Factor (n,) on variances with such features (n, 6)."""
+        return np.exp(features @ np.array(self.depth))
+
+
+def variance_features(relative: Array, epistemic: Array, confidence: Array, pixels: Array, focal: Array) -> Array:
+    """What is known of n depths and how sure they are (n, 6), all as logarithms.
+
+    Args:
+        relative: (n,) reported variance over the squared depth.
+        epistemic: (n,) share of the variance between samples in that.
+        confidence: (n,) that this is an object.
+        pixels: (n,) visible pixels.
+        focal: (n,) px.
+    """
+    columns = (
+        np.ones_like(relative),
+        np.log(np.maximum(relative, 1e-8) / 0.003),
+        np.log(np.maximum(epistemic, 0.02) / 0.2),
+        np.log(np.maximum(confidence, 0.05)),
+        np.log(np.maximum(pixels, 1) / 300),
+        np.log(focal / 230),
+    )
+    return np.stack(columns, axis=1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("safetensors")
 
+from covis.agents.perception import make_perceptor  # noqa: E402
 from covis.agents.perception import weights as stored  # noqa: E402
 from covis.agents.perception.decode import (  # noqa: E402
     draw_masks,
@@ -19,7 +20,8 @@ from covis.agents.perception.decode import (  # noqa: E402
     spread_pixels,
     suppress,
 )
-from covis.agents.perception.learned import LearnedPerception, LearnedPerceptionParams  # noqa: E402
+from covis.agents.perception.kinds import kind, open_eyes  # noqa: E402
+from covis.agents.perception.learned import LearnedPerception, LearnedPerceptionParams, camera_height  # noqa: E402
 from covis.agents.perception.network import (  # noqa: E402
     Eyes,
     Geometry,
@@ -31,6 +33,7 @@ from covis.agents.perception.network import (  # noqa: E402
     normalised,
 )
 from covis.agents.perception.targets import draw_heat, object_table, points_around  # noqa: E402
+from covis.envs.scenes import parallel_env  # noqa: E402
 
 CLASSES = ("car", "van", "husky", "crate")
 TINY = NetworkParams(CLASSES, widths=(8, 8, 16, 16, 16), blocks=(1, 0, 0, 0), neck=16, head=16, embedding=4)
@@ -296,7 +299,8 @@ def test_one_sample_is_without_dropout_and_deterministic():
 
 
 def test_calibration_scales_the_reported_variance():
-    plain, scaled = tiny_weights(), replace(tiny_weights(), calibration=stored.Calibration(depth=4.0))
+    four_times = (np.log(4.0), *[0.0] * (len(stored.VARIANCE_FEATURES) - 1))
+    plain, scaled = tiny_weights(), replace(tiny_weights(), calibration=stored.Calibration(depth=four_times))
     params = LearnedPerceptionParams(samples=2, score=0.1, min_pixels=1)
     a, b = (
         LearnedPerception(CLASSES, w, params)(observation(), np.random.default_rng(0)).graph for w in (plain, scaled)
@@ -327,11 +331,39 @@ def test_an_image_without_objects_gives_an_empty_graph():
     assert found.graph.attributes.shape == (0, 4)
 
 
+def test_a_robot_reads_its_height_and_how_sure_it_is_from_its_pose():
+    tilted = np.array([[0, 0.6, 0.8, 1], [-1, 0, 0, 2], [0, -0.8, 0.6, 0.7], [0, 0, 0, 1]])
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3] = np.diag([9.0, 0.04, 0.09])  # camera frame: right, down, forward
+    height, std = camera_height({"pose": tilted, "pose_covariance": covariance})
+    assert height == 0.7
+    assert std == pytest.approx(np.sqrt(0.64 * 0.04 + 0.36 * 0.09))
+    assert camera_height({}) == (0.0, np.inf)
+    with pytest.raises(ValueError, match="pose must be finite"):
+        camera_height({"pose": np.full((4, 4), np.nan)})
+    with pytest.raises(ValueError, match="pose_covariance"):
+        camera_height({"pose": tilted, "pose_covariance": np.zeros(6)})
+
+
+def test_the_height_moves_the_depth_as_far_as_it_can_be_trusted():
+    look = eyes(samples=1)
+    pose = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 2.0], [0, 0, 0, 1.0]])
+    sure = {"pose": pose, "pose_covariance": np.zeros((6, 6))}
+    unsure = {"pose": pose, "pose_covariance": 1e8 * np.eye(6)}
+    depths = [look.see(observation() | more, np.random.default_rng(0)).depth for more in ({}, unsure, sure)]
+    np.testing.assert_allclose(depths[0], depths[1], rtol=1e-4)
+    assert np.abs(depths[0] / depths[2] - 1).max() > 1e-3
+
+
 # Weights and bad input
 
 
 def test_weights_come_back_as_they_were_saved(tmp_path):
-    saved = replace(tiny_weights(), calibration=stored.Calibration(1.1, 2.0, 3.0, 1.5), notes={"minutes": 1})
+    saved = replace(
+        tiny_weights(),
+        calibration=stored.Calibration(1.1, (1.0, 0.5, 0.1, 0.0, -0.2, 0.3), 3.0, 1.5),
+        notes={"minutes": 1},
+    )
     stored.save(saved, tmp_path)
     loaded = stored.load(tmp_path)
     assert loaded.classes == CLASSES
@@ -376,6 +408,27 @@ def test_unknown_classes_are_named():
         LearnedPerception(("car", "submarine"), tiny_weights())
     with pytest.raises(ValueError, match="class"):
         LearnedPerception((), tiny_weights())
+
+
+def test_weights_of_an_unknown_network_are_refused():
+    strange = replace(tiny_weights(), network=TINY.to_dict() | {"kind": "crystal ball"})
+    with pytest.raises(ValueError, match="crystal ball"):
+        open_eyes(strange, CLASSES)
+    with pytest.raises(ValueError, match="compact, maskrcnn"):
+        kind("")
+
+
+def test_eyes_of_a_folder(tmp_path):
+    env = parallel_env("target_localization", width=128, height=96)
+    with pytest.raises(stored.WeightsError, match="needs"):
+        make_perceptor(f"learned:{tmp_path}", env)
+    with pytest.raises(ValueError, match="learned:FOLDER"):
+        make_perceptor("learned:", env)
+    names = (*env.classes, "unicorn")
+    stored.save(tiny_weights(params=replace(TINY, classes=names)), tmp_path)
+    eyes = make_perceptor(f"learned:{tmp_path}", env)
+    assert isinstance(eyes, LearnedPerception)
+    assert eyes.network.params.classes == names
 
 
 @pytest.mark.parametrize("samples", [0, -1, 2.5])

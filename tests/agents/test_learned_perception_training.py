@@ -10,7 +10,7 @@ pytest.importorskip("pybullet")
 
 from covis.agents.perception import frames as source  # noqa: E402
 from covis.agents.perception.frames import FrameSource, Variant, training_variants  # noqa: E402
-from covis.agents.perception.losses import LossWeights, iou, losses, make_batch  # noqa: E402
+from covis.agents.perception.losses import LossWeights, iou, losses, make_batch, overlap_loss  # noqa: E402
 from covis.agents.perception.network import Eyes, NetworkParams  # noqa: E402
 from covis.agents.perception.training import (  # noqa: E402
     CHECKPOINT,
@@ -250,3 +250,23 @@ def test_two_workers_average_their_weights(tmp_path):
     alone = train(quick(steps=2), tmp_path / "alone", network=tiny())
     pairs = zip(state.network.parameters(), alone.network.parameters(), strict=True)
     assert any((a != b).any() for a, b in pairs)
+
+
+def test_expected_overlap_is_learned_from_evenly_spread_points():
+    labels = torch.zeros(2, 8)
+    labels[:, :3] = 1
+    logits = torch.where(labels > 0, 5.0, -5.0)
+    logits[1] = -logits[1]  # the first mask is right, the second wrong everywhere
+    sure = overlap_loss(torch.tensor([4.0, -4.0]), logits, labels)
+    assert sure < overlap_loss(torch.tensor([0.0, 0.0]), logits, labels)
+    assert sure < overlap_loss(torch.tensor([-4.0, 4.0]), logits, labels)
+
+
+def test_heights_are_reported_with_their_noise_and_sometimes_not_at_all():
+    pairs = source.FrameSource(width=64, height=64).chunk(0)
+    batches = [make_batch(pairs, np.random.default_rng(i)) for i in range(40)]
+    true = torch.tensor([f.camera_height_m for pair in pairs for f in pair])
+    height, std = torch.stack([b.height for b in batches]), torch.stack([b.height_std for b in batches])
+    known = std.isfinite()
+    assert 0.03 < 1 - known.float().mean() < 0.2
+    assert ((height - true) / std)[known].std() == pytest.approx(1, abs=0.15)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from covis.agents.perception.weights import Calibration, variance_features
 from covis.evaluation.perception_benchmark import (
     MIN_PIXELS,
     CocoRecords,
@@ -10,6 +11,7 @@ from covis.evaluation.perception_benchmark import (
     Tally,
     count,
     ence,
+    exact_spearman,
     match_masks,
     perception_benchmark,
     row,
@@ -93,6 +95,7 @@ def gaussian_tally(scale: float, n: int = 4000, seed: int = 0) -> Tally:
         true_distance=[distance - error],
         depth_ratio=[np.ones(n)],
         size=[rng.uniform(60, 600, n)],
+        known=[variance_features(u / distance**2, np.full(n, 0.2), np.ones(n), np.full(n, 300), np.full(n, 230.0))],
     )
 
 
@@ -104,8 +107,11 @@ def test_ence_is_small_when_calibrated_and_known_when_not():
 
 
 def test_calibration_recovers_the_factors():
-    found = calibrate([gaussian_tally(4), gaussian_tally(4, seed=1)])
-    assert found.depth == pytest.approx(4, rel=0.15)
+    tallies = [gaussian_tally(4), gaussian_tally(4, seed=1)]
+    found = calibrate(tallies)
+    for tally in tallies:
+        np.testing.assert_allclose(found.variance_factor(tally.of("known")), 4, rtol=0.3)
+        assert np.median(found.variance_factor(tally.of("known"))) == pytest.approx(4, rel=0.1)
     assert found.centre == pytest.approx(4, rel=0.15)
     assert found.class_temperature == pytest.approx(1, rel=0.1)
 
@@ -117,11 +123,33 @@ def test_calibration_undoes_a_bias_of_scale():
     biased.u = [1.21 * u for u in biased.u]
     found = calibrate([biased])
     assert found.scale == pytest.approx(1 / 1.1)
-    assert found.depth == pytest.approx(1, rel=0.15)
+    assert np.median(found.variance_factor(biased.of("known"))) == pytest.approx(1, rel=0.15)
+
+
+def test_calibration_learns_that_small_objects_err_more_than_reported():
+    n = 4000
+    biased = gaussian_tally(1, n)
+    pixels = np.exp(np.random.default_rng(3).uniform(np.log(40), np.log(4000), n))
+    biased.error = [biased.error[0] * np.sqrt(300 / pixels)]
+    biased.true_distance = [biased.distance[0] - biased.error[0]]
+    relative = biased.u[0] / biased.distance[0] ** 2
+    biased.known = [variance_features(relative, np.full(n, 0.2), np.ones(n), pixels, np.full(n, 230.0))]
+    factor = calibrate([biased]).variance_factor(biased.known[0])
+    assert np.corrcoef(np.log(factor), -np.log(pixels))[0, 1] > 0.95
+    corrected, squared = factor * biased.u[0], biased.error[0] ** 2
+    assert ence(corrected, squared) < 0.5 * ence(biased.u[0], squared)
 
 
 def test_calibration_without_detections_changes_nothing():
-    assert calibrate([Tally()]).depth == 1
+    assert calibrate([Tally()]) == Calibration()
+
+
+def test_exact_spearman_needs_variances_that_differ():
+    rng = np.random.default_rng(0)
+    alike, spread = np.exp(0.1 * rng.normal(size=3000)), np.exp(3 * rng.normal(size=3000))
+    assert exact_spearman(alike) == pytest.approx(0, abs=0.1)
+    assert exact_spearman(spread) > 0.7
+    assert exact_spearman(np.ones(5)) is None
 
 
 def test_spearman_of_orders():
@@ -173,6 +201,8 @@ def test_counting_one_image():
         attributes=np.array([[0.9, 0.1], [0.8, 0.2]]),
         position_variance=np.array([1.0, 0.1]),
         attribute_variance=np.array([0.1, 0.2]),
+        intrinsics=np.diag([230.0, 230.0, 1.0]),
+        image_size=(80, 60),
     )
     seen = Seen(
         Detections(graph, np.zeros((2, 4)), masks[:2]),
