@@ -97,7 +97,7 @@ class Tally:
         u, v: (k,) reported uncertainties; across (k,) m^2, reported variance per axis across the viewing ray.
         attributes, true_class: (k, c), (k,).
         size: (k,) visible pixels.
-        known: (k, 6) `variance_features` of the reported variances.
+        known: (k, 4) `variance_features` of the reported variances.
         milliseconds: per image.
     """
 
@@ -309,18 +309,15 @@ def count(out: Tally, image: Image, seen: Seen, score: float) -> None:
     out.across.append(0.5 * (np.trace(covariances, axis1=1, axis2=2) - graph.position_variance))
     out.attributes.append(graph.attributes)
     out.true_class.append(image.object_class[true])
-    out.known.append(_known(seen, found, graph.intrinsics[0, 0]))
+    out.known.append(_known(seen, found))
     out.size.append(image.pixels[true].astype(np.float64))
 
 
-def _known(seen: Seen, found: NDArray[np.int64], focal: float) -> Array:
+def _known(seen: Seen, found: NDArray[np.int64]) -> Array:
     from ..agents.perception.weights import variance_features
 
     variance, depth = seen.depth_variance[found], seen.depth[found]
-    share = seen.depth_epistemic[found] / variance
-    return variance_features(
-        variance / depth**2, share, seen.scores[found], seen.pixels[found], np.full(len(found), focal)
-    )
+    return variance_features(variance / depth**2, seen.depth_epistemic[found] / variance, seen.scores[found])
 
 
 def match_masks(masks: NDArray[np.bool_], instances: NDArray[np.int32], pixels: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -58,6 +58,7 @@ def training_notes(state: State, params: TrainingParams) -> dict[str, Any]:
     """How the network was trained, as the manifest keeps it."""
     return {
         "seed": params.seed,
+        "workers": params.workers,
         "steps": state.step,
         "images": state.images,
         "minutes": round(state.seconds / 60, 1),
@@ -96,7 +97,7 @@ def _variance_correction(known: Sequence[Array], ratios: Sequence[Array]) -> tup
     """Coefficients of the log of the factor on the variance that make the errors of all scenes together most likely.
 
     Args:
-        known: (k, 6) features of each scene's detections.
+        known: (k, 4) features of each scene's detections.
         ratios: (k,) squared errors over reported variances.
     """
     features, ratio = np.concatenate(known), np.concatenate(ratios)

@@ -247,11 +247,11 @@ class LearnedPerception:
         seen = depth_features(dense, geometry, image, pixels.reshape(-1, 2), box)
         log_depth, log_variance = self.network.depth(seen, T > 1, generator, draws=T)
         return self._summarised(
-            log_depth.view(T, n, D), log_variance.view(T, n, D), float(geometry.focal[0]), found.scores, found.pixels
+            log_depth.view(T, n, D), log_variance.view(T, n, D), float(geometry.focal[0]), found.scores
         )
 
     def _summarised(
-        self, log_depth: Tensor, log_variance: Tensor, focal: float, scores: Array, pixels: NDArray[np.int64]
+        self, log_depth: Tensor, log_variance: Tensor, focal: float, scores: Array
     ) -> tuple[Array, Array, Array]:
         """Depth (n,), its variance and the epistemic part of that, calibrated, of samples (T, n, pixels)."""
         z = self.calibration.scale * focal / REFERENCE_FOCAL_PX * torch.exp(log_depth.double())
@@ -259,9 +259,7 @@ class LearnedPerception:
         aleatoric = (z**2 * torch.exp(log_variance.double())).mean((0, 2)).numpy()
         epistemic = z.var(0, unbiased=False).mean(1).numpy()
         variance = aleatoric + epistemic
-        known = stored.variance_features(
-            variance / depth**2, epistemic / variance, scores, pixels, np.full(len(depth), focal)
-        )
+        known = stored.variance_features(variance / depth**2, epistemic / variance, scores)
         factor = self.calibration.variance_factor(known)
         return depth, factor * variance, factor * epistemic
 

@@ -25,7 +25,7 @@ class WeightsError(RuntimeError):
     """Weights that are missing, altered or of another format; the message names the file."""
 
 
-VARIANCE_FEATURES = ("constant", "variance", "epistemic", "confidence", "pixels", "focal")
+VARIANCE_FEATURES = ("constant", "variance", "epistemic", "confidence")
 """Of what the correction of a depth's variance is a linear function, see `variance_features`."""
 
 
@@ -55,27 +55,23 @@ class Calibration:
             raise ValueError(f"Calibration.depth must be {len(VARIANCE_FEATURES)} finite numbers, got {self.depth}")
 
     def variance_factor(self, features: Array) -> Array:
-        """Factor (n,) on variances with such features (n, 6)."""
+        """Factor (n,) on variances with such features (n, 4)."""
         return np.exp(features @ np.array(self.depth))
 
 
-def variance_features(relative: Array, epistemic: Array, confidence: Array, pixels: Array, focal: Array) -> Array:
-    """What is known of n depths and how sure they are (n, 6), all as logarithms.
+def variance_features(relative: Array, epistemic: Array, confidence: Array) -> Array:
+    """What is known of how sure n depths are (n, 4), all as logarithms.
 
     Args:
         relative: (n,) reported variance over the squared depth.
         epistemic: (n,) share of the variance between samples in that.
         confidence: (n,) that this is an object.
-        pixels: (n,) visible pixels.
-        focal: (n,) px.
     """
     columns = (
         np.ones_like(relative),
         np.log(np.maximum(relative, 1e-8) / 0.003),
         np.log(np.maximum(epistemic, 0.02) / 0.2),
         np.log(np.maximum(confidence, 0.05)),
-        np.log(np.maximum(pixels, 1) / 300),
-        np.log(focal / 230),
     )
     return np.stack(columns, axis=1)
 

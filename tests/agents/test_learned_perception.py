@@ -361,7 +361,7 @@ def test_the_height_moves_the_depth_as_far_as_it_can_be_trusted():
 def test_weights_come_back_as_they_were_saved(tmp_path):
     saved = replace(
         tiny_weights(),
-        calibration=stored.Calibration(1.1, (1.0, 0.5, 0.1, 0.0, -0.2, 0.3), 3.0, 1.5),
+        calibration=stored.Calibration(1.1, (1.0, 0.5, 0.1, -0.2), 3.0, 1.5),
         notes={"minutes": 1},
     )
     stored.save(saved, tmp_path)

@@ -95,7 +95,7 @@ def gaussian_tally(scale: float, n: int = 4000, seed: int = 0) -> Tally:
         true_distance=[distance - error],
         depth_ratio=[np.ones(n)],
         size=[rng.uniform(60, 600, n)],
-        known=[variance_features(u / distance**2, np.full(n, 0.2), np.ones(n), np.full(n, 300), np.full(n, 230.0))],
+        known=[variance_features(u / distance**2, np.full(n, 0.2), np.ones(n))],
     )
 
 
@@ -126,16 +126,16 @@ def test_calibration_undoes_a_bias_of_scale():
     assert np.median(found.variance_factor(biased.of("known"))) == pytest.approx(1, rel=0.15)
 
 
-def test_calibration_learns_that_small_objects_err_more_than_reported():
+def test_calibration_learns_that_doubtful_objects_err_more_than_reported():
     n = 4000
     biased = gaussian_tally(1, n)
-    pixels = np.exp(np.random.default_rng(3).uniform(np.log(40), np.log(4000), n))
-    biased.error = [biased.error[0] * np.sqrt(300 / pixels)]
+    confidence = np.random.default_rng(3).uniform(0.1, 1, n)
+    biased.error = [biased.error[0] / confidence]
     biased.true_distance = [biased.distance[0] - biased.error[0]]
     relative = biased.u[0] / biased.distance[0] ** 2
-    biased.known = [variance_features(relative, np.full(n, 0.2), np.ones(n), pixels, np.full(n, 230.0))]
+    biased.known = [variance_features(relative, np.full(n, 0.2), confidence)]
     factor = calibrate([biased]).variance_factor(biased.known[0])
-    assert np.corrcoef(np.log(factor), -np.log(pixels))[0, 1] > 0.95
+    assert np.corrcoef(np.log(factor), -np.log(confidence))[0, 1] > 0.95
     corrected, squared = factor * biased.u[0], biased.error[0] ** 2
     assert ence(corrected, squared) < 0.5 * ence(biased.u[0], squared)
 
@@ -201,8 +201,6 @@ def test_counting_one_image():
         attributes=np.array([[0.9, 0.1], [0.8, 0.2]]),
         position_variance=np.array([1.0, 0.1]),
         attribute_variance=np.array([0.1, 0.2]),
-        intrinsics=np.diag([230.0, 230.0, 1.0]),
-        image_size=(80, 60),
     )
     seen = Seen(
         Detections(graph, np.zeros((2, 4)), masks[:2]),
