@@ -49,7 +49,7 @@ class LearnedPerceptionParams:
     """
 
     samples: int = 16
-    score: float = 0.5
+    score: float = 0.55
     candidates: int = 64
     min_pixels: int = 40
     depth_pixels: int = 12
