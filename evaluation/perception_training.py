@@ -23,6 +23,7 @@ FIGURES = ("ap50", "class_accuracy", "depth_abs_rel", "depth_spearman", "ence")
 MEDIAN_CHI_SQUARED_2 = 2 * np.log(2)
 SMALLEST_TALLY = 30
 RIDGE = 0.003
+SMALLEST_ERROR = 0.01
 
 
 def known_targets() -> list[PerceptionTarget]:
@@ -67,9 +68,9 @@ def training_notes(state: State, params: TrainingParams) -> dict[str, Any]:
 
 
 def calibrate(tallies: Sequence[Tally]) -> Calibration:
-    """Factor on the depth, correction of its variance, class temperature: what fits that which uncalibrated eyes saw.
+    """Corrections of depth and variances, and the class temperature, that fit what uncalibrated eyes saw.
 
-    Scenes count alike. The factor on the depth makes the median of its logarithmic error zero; the correction of its
+    Scenes count alike. The correction of the depth has the least absolute logarithmic error; the correction of its
     variance makes the errors most likely, see `_variance_correction`; the factor on the centre's variance makes the
     median of the squared lateral error that of two Gaussian axes; the temperature has the least negative log-likelihood
     of the true classes. Scenes with too few detections are left out.
@@ -79,18 +80,34 @@ def calibrate(tallies: Sequence[Tally]) -> Calibration:
     used = [t for t in tallies if len(t.of("u")) >= SMALLEST_TALLY]
     if not used:
         return Calibration()
-    scale = float(np.exp(-np.mean([np.median(np.log(t.of("depth_ratio"))) for t in used])))
-    squared = [(scale * t.of("distance") - t.of("true_distance")) ** 2 for t in used]
-    ratios = [e / (scale**2 * t.of("u")) for t, e in zip(used, squared, strict=True)]
+    scale, exponent = _depth_correction([t.of("distance") for t in used], [t.of("depth_ratio") for t in used])
+    corrected = [scale * t.of("distance") ** exponent for t in used]
+    squared = [(d - t.of("true_distance")) ** 2 for t, d in zip(used, corrected, strict=True)]
+    ratios = [e / (t.of("u") * (d / t.of("distance")) ** 2) for t, d, e in zip(used, corrected, squared, strict=True)]
     lateral = [np.median(t.of("lateral") ** 2 / t.of("across")) / MEDIAN_CHI_SQUARED_2 for t in used]
     temperatures = np.exp(np.linspace(np.log(0.3), np.log(3), 61))
     surprise = [np.mean([_negative_log_likelihood(t, x) for t in used]) for x in temperatures]
     return Calibration(
         scale=scale,
+        exponent=exponent,
         depth=_variance_correction([t.of("known") for t in used], ratios),
         centre=float(np.exp(np.mean(np.log(lateral)))),
         class_temperature=float(temperatures[int(np.argmin(surprise))]),
     )
+
+
+def _depth_correction(distances: Sequence[Array], ratios: Sequence[Array]) -> tuple[float, float]:
+    """Scale and exponent that bring distances (k,) of each scene nearest to the truth, given their ratios (k,) to it.
+
+    Least absolute error of the logarithm, by least squares reweighted.
+    """
+    x, y = np.log(np.concatenate(distances)), -np.log(np.concatenate(ratios))
+    share = np.concatenate([np.full(len(r), 1 / len(r)) for r in ratios])
+    line, weight = np.zeros(2), share
+    for _ in range(50):
+        line = np.polyfit(x, y, 1, w=np.sqrt(weight))
+        weight = share / np.maximum(np.abs(y - np.polyval(line, x)), SMALLEST_ERROR)
+    return float(np.exp(line[1])), float(1 + line[0])
 
 
 def _variance_correction(known: Sequence[Array], ratios: Sequence[Array]) -> tuple[float, ...]:

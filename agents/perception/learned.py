@@ -254,7 +254,8 @@ class LearnedPerception:
         self, log_depth: Tensor, log_variance: Tensor, focal: float, scores: Array
     ) -> tuple[Array, Array, Array]:
         """Depth (n,), its variance and the epistemic part of that, calibrated, of samples (T, n, pixels)."""
-        z = self.calibration.scale * focal / REFERENCE_FOCAL_PX * torch.exp(log_depth.double())
+        z = focal / REFERENCE_FOCAL_PX * torch.exp(log_depth.double())
+        z = self.calibration.scale * z**self.calibration.exponent
         depth = z.mean((0, 2)).numpy()
         aleatoric = (z**2 * torch.exp(log_variance.double())).mean((0, 2)).numpy()
         epistemic = z.var(0, unbiased=False).mean(1).numpy()

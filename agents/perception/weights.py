@@ -34,19 +34,20 @@ class Calibration:
     """What makes depths unbiased and the reported uncertainty true, found on validation seeds.
 
     Attributes:
-        scale: factor on the depth itself.
+        scale, exponent: a depth of z m is corrected to scale * z ** exponent.
         depth: coefficients, one per `VARIANCE_FEATURES`, of the log of the factor on its variance.
         centre: factor on the variance of the projected centre.
         class_temperature: logits are divided by it.
     """
 
     scale: float = 1.0
+    exponent: float = 1.0
     depth: tuple[float, ...] = (0.0,) * len(VARIANCE_FEATURES)
     centre: float = 1.0
     class_temperature: float = 1.0
 
     def __post_init__(self) -> None:
-        for name in ("scale", "centre", "class_temperature"):
+        for name in ("scale", "exponent", "centre", "class_temperature"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
                 raise ValueError(f"Calibration.{name} must be positive, got {value}")

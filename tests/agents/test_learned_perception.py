@@ -361,7 +361,7 @@ def test_the_height_moves_the_depth_as_far_as_it_can_be_trusted():
 def test_weights_come_back_as_they_were_saved(tmp_path):
     saved = replace(
         tiny_weights(),
-        calibration=stored.Calibration(1.1, (1.0, 0.5, 0.1, -0.2), 3.0, 1.5),
+        calibration=stored.Calibration(1.1, 0.98, (1.0, 0.5, 0.1, -0.2), 3.0, 1.5),
         notes={"minutes": 1},
     )
     stored.save(saved, tmp_path)
@@ -465,7 +465,7 @@ def test_a_wrong_size_or_no_image_is_refused():
 )
 def test_shipped_weights_reproduce_a_stored_prediction():
     with np.load(STORED) as kept:
-        seen = {name: kept[name] for name in ("image", "intrinsics", "up")}
+        seen = {name: kept[name] for name in ("image", "intrinsics", "up", "pose", "pose_covariance")}
         look = LearnedPerception(kept["classes"].tolist(), params=LearnedPerceptionParams(samples=1))
         found = look(seen, np.random.default_rng(0))
         assert len(found) == len(kept["positions"]) > 3

@@ -122,8 +122,18 @@ def test_calibration_undoes_a_bias_of_scale():
     biased.depth_ratio = [1.1 * r for r in biased.depth_ratio]
     biased.u = [1.21 * u for u in biased.u]
     found = calibrate([biased])
-    assert found.scale == pytest.approx(1 / 1.1)
+    assert found.scale == pytest.approx(1 / 1.1, rel=0.03)
+    assert found.exponent == pytest.approx(1, abs=0.01)
     assert np.median(found.variance_factor(biased.of("known"))) == pytest.approx(1, rel=0.15)
+
+
+def test_calibration_straightens_depths():
+    bent = gaussian_tally(0.001)
+    true = bent.true_distance[0]
+    bent.distance = [1.2 * true**0.9 + bent.error[0]]
+    bent.depth_ratio = [bent.distance[0] / true]
+    found = calibrate([bent])
+    np.testing.assert_allclose(found.scale * (1.2 * true**0.9) ** found.exponent, true, rtol=0.01)
 
 
 def test_calibration_learns_that_doubtful_objects_err_more_than_reported():
