@@ -160,6 +160,9 @@ def fuse(
 
     Returns:
         Every group with a position in the frame; groups seen only by robots of unknown pose are left out.
+
+    Raises:
+        ValueError: a robot or gain that does not exist, or relative poses surer than `frame_covariance` allows.
     """
     _check(graphs, frame, gain)
     groups = matchings if isinstance(matchings, Groups) else group_detections([len(g) for g in graphs], matchings)
@@ -305,7 +308,12 @@ def _fuse_sharing(
     partners = rows.copy()
     partners[:, frame] = -1
     some = (partners >= 0).any(axis=1)
-    theirs, theirs_covariances = _fuse_groups(partners[some], positions, covariances - shared)
+    unshared = covariances - shared
+    used = np.unique(partners[partners >= 0])
+    least = np.diagonal(unshared[used], axis1=1, axis2=2)
+    if (least < -1e-9 * np.diagonal(covariances[used], axis1=1, axis2=2)).any():
+        raise ValueError("frame_covariance is larger than the covariance of the relative poses that should contain it")
+    theirs, theirs_covariances = _fuse_groups(partners[some], positions, unshared)
     theirs_covariances = theirs_covariances + shared[partners[some].max(axis=1)]
     both = np.full((m, 2), -1, dtype=np.int64)
     both[:, 0] = rows[:, frame]

@@ -211,3 +211,9 @@ def test_empty_graphs():
     assert len(fuse([empty, empty], still, {})) == 0
     assert fuse_own([empty, some], still, {(0, 1): Matching.empty()}, 0).positions.shape == (0, 3)
     assert len(fuse([empty, some], still, {(0, 1): Matching.empty()})) == 2
+
+
+def test_relative_poses_surer_than_the_frames_own_pose_are_refused():
+    graphs, poses, full, _ = team(np.random.default_rng(3))
+    with pytest.raises(ValueError, match="frame_covariance is larger"):
+        fuse(graphs, poses, full, frame_covariance=np.eye(6))
