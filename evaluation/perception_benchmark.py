@@ -388,7 +388,7 @@ def ence(variance: Array, squared_error: Array, bins: int = ENCE_BINS) -> float 
 
 
 def shift(known: Tally, strange: Tally) -> dict[str, float | None]:
-    """How much u and v rise out of distribution, among objects matched in range and size.
+    """How much u, v and the squared errors rise out of distribution, among objects matched in range and size.
 
     Objects fall into bins a third of an octave of range by an octave of visible pixels; each bin counts by the smaller
     of its two numbers. Ratios of weighted means, strange over known.
@@ -397,9 +397,10 @@ def shift(known: Tally, strange: Tally) -> dict[str, float | None]:
         np.stack([np.floor(3 * np.log2(t.of("true_distance"))), np.floor(np.log2(t.of("size")))], axis=1)
         for t in (known, strange)
     ]
-    out: dict[str, float | None] = {"u_ratio_matched": None, "v_ratio_matched": None, "matched_objects": 0}
+    names = ("u_ratio_matched", "v_ratio_matched", "squared_error_ratio_matched")
+    out: dict[str, float | None] = dict.fromkeys(names) | {"matched_objects": 0}
     keys = np.unique(np.concatenate(bins), axis=0)
-    sums = np.zeros((2, 2))
+    sums = np.zeros((2, 3))
     total = 0.0
     for key in keys:
         chosen = [(b == key).all(axis=1) for b in bins]
@@ -408,10 +409,10 @@ def shift(known: Tally, strange: Tally) -> dict[str, float | None]:
             continue
         total += weight
         for side, (t, c) in enumerate(zip((known, strange), chosen, strict=True)):
-            sums[side] += weight * np.array([t.of("u")[c].mean(), t.of("v")[c].mean()])
+            sums[side] += weight * np.array([values[c].mean() for values in (t.of("u"), t.of("v"), t.of("error") ** 2)])
     if total and (sums[0] > 0).all():
         ratio = sums[1] / sums[0]
-        out |= {"u_ratio_matched": float(ratio[0]), "v_ratio_matched": float(ratio[1]), "matched_objects": int(total)}
+        out |= dict(zip(names, ratio.tolist(), strict=True)) | {"matched_objects": int(total)}
     return out
 
 
@@ -498,4 +499,5 @@ def table_columns() -> Iterable[tuple[str, str]]:
         ("ence", "ENCE"),
         ("u_ratio_matched", "u ratio"),
         ("v_ratio_matched", "v ratio"),
+        ("squared_error_ratio_matched", "e² ratio"),
     )

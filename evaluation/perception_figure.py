@@ -25,6 +25,7 @@ TITLES = (
     "u: position uncertainty, m (1 sigma)",
 )
 GREY = 0.35
+SMALLEST_SHOWN = 0.001
 IMAGES = 12
 """Of each target, from which the figure takes one."""
 BAND = 22
@@ -93,17 +94,33 @@ def _outlined(image: Picture, masks: NDArray[np.bool_]) -> Picture:
 
 
 def _painted(background: Array, found: Detections, values: Array) -> Picture:
-    """Each mask in the colour of its value, from the least (dark) to the greatest (bright), with its number."""
+    """Each mask in the colour of its value, from the least (dark) to the greatest (bright), with its number.
+
+    Where numbers would cover each other, those of the larger masks stay.
+    """
     assert found.masks is not None
     out = background.astype(np.uint8)
     span = np.ptp(values) if len(values) else 0.0
-    for mask, box, value in zip(found.masks, found.boxes, values, strict=True):
+    for mask, value in zip(found.masks, values, strict=True):
         share = (value - values.min()) / span if span > 0 else 0.5
         level = np.array([[round(255 * float(share))]], np.uint8)
         out[mask] = cv2.cvtColor(cv2.applyColorMap(level, cv2.COLORMAP_VIRIDIS), cv2.COLOR_BGR2RGB)[0, 0]
-        at = int(box[0]), int(max(box[1] - 2, 8))
-        cv2.putText(out, f"{value:.2g}", at, cv2.FONT_HERSHEY_SIMPLEX, 0.33, (255, 255, 255), 1, cv2.LINE_AA)
+    written = np.zeros(out.shape[:2], bool)
+    for i in np.argsort(-found.masks.sum(axis=(1, 2)), kind="stable"):
+        text = f"{values[i]:.2g}" if values[i] >= SMALLEST_SHOWN else "0"
+        _write(out, written, text, int(found.boxes[i, 0]), int(max(found.boxes[i, 1] - 2, 9)))
     return out
+
+
+def _write(out: Picture, written: NDArray[np.bool_], text: str, left: int, bottom: int) -> None:
+    """White text, unless something is `written` there already."""
+    (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.33, 1)
+    left = max(0, min(left, out.shape[1] - width))
+    place = np.s_[max(bottom - height, 0) : bottom + 2, left : left + width + 2]
+    if written[place].any():
+        return
+    written[place] = True
+    cv2.putText(out, text, (left, bottom), cv2.FONT_HERSHEY_SIMPLEX, 0.33, (255, 255, 255), 1, cv2.LINE_AA)
 
 
 def _titled(panel: Picture, title: str) -> Picture:

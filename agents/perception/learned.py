@@ -152,8 +152,7 @@ class LearnedPerception:
         clock = Clock()
         image = self._checked(observation)
         rows, columns = image.shape[:2]
-        K = np.asarray(observation["intrinsics"], dtype=np.float64)
-        up = np.asarray(observation["up"], dtype=np.float64)
+        K, up = finite(observation, "intrinsics", (3, 3)), finite(observation, "up", (3,))
         height, height_std = (torch.tensor([value]) for value in camera_height(observation))
         geometry = Geometry.of(torch.from_numpy(K[None]), torch.from_numpy(up[None]), height, height_std)
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
@@ -336,6 +335,20 @@ def graph_of(
     )
 
 
+def finite(observation: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Array:
+    """A leaf of an observation as floats.
+
+    Raises:
+        ValueError: it is not there, of another shape, or not finite.
+    """
+    if name not in observation:
+        raise ValueError(f'learned perception needs the observation\'s "{name}"')
+    value = np.asarray(observation[name], dtype=np.float64)
+    if value.shape != shape or not np.isfinite(value).all():
+        raise ValueError(f"{name} must be finite and of shape {shape}, got shape {value.shape}: {value.tolist()}")
+    return value
+
+
 def camera_height(observation: Mapping[str, Any]) -> tuple[float, float]:
     """Height of a robot's camera above the ground, m, and its deviation, by its own noisy pose; infinite without one.
 
@@ -346,11 +359,8 @@ def camera_height(observation: Mapping[str, Any]) -> tuple[float, float]:
     """
     if "pose" not in observation:
         return 0.0, math.inf
-    pose = np.asarray(observation["pose"], dtype=np.float64)
-    covariance = np.asarray(observation.get("pose_covariance", np.zeros((6, 6))), dtype=np.float64)
-    for name, value, shape in (("pose", pose, (4, 4)), ("pose_covariance", covariance, (6, 6))):
-        if value.shape != shape or not np.isfinite(value).all():
-            raise ValueError(f"{name} must be finite and of shape {shape}, got shape {value.shape}: {value.tolist()}")
+    pose = finite(observation, "pose", (4, 4))
+    covariance = finite(observation, "pose_covariance", (6, 6))
     up = pose[2, :3]  # right perturbation: the covariance is in the camera frame
     return float(pose[2, 3]), math.sqrt(max(float(up @ covariance[:3, :3] @ up), 0.0))
 

@@ -26,7 +26,7 @@ from ...matching.pose import Array
 from . import weights as stored
 from .decode import spread_pixels, tight_boxes
 from .detections import Detections
-from .learned import Clock, LearnedPerception, Seen, class_uncertainty, graph_of
+from .learned import Clock, LearnedPerception, Seen, class_uncertainty, finite, graph_of
 from .losses import Batch, LossWeights, gaussian_loss
 from .network import REFERENCE_FOCAL_PX, bilinear, dropout
 
@@ -212,8 +212,7 @@ class MaskRCNNPerception(LearnedPerception):
         clock = Clock()
         image = self._checked(observation)
         height, width = image.shape[:2]
-        K = np.asarray(observation["intrinsics"], dtype=np.float64)
-        up = np.asarray(observation["up"], dtype=np.float64)
+        K, up = finite(observation, "intrinsics", (3, 3)), finite(observation, "up", (3,))
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
         pixels = torch.from_numpy(image).permute(2, 0, 1).float() / 255
         found = self._detect(pixels, generator)

@@ -444,6 +444,9 @@ def test_fewer_than_one_sample_is_refused(samples):
         ({"image": np.zeros((96, 128), np.uint8)}, "shape"),
         ({"image": np.zeros((90, 127, 3), np.uint8)}, "multiples of 4"),
         ({"image": np.zeros((32, 32, 3), np.uint8)}, "at least 64"),
+        ({"intrinsics": np.full((3, 3), np.nan)}, "intrinsics must be finite"),
+        ({"up": np.zeros(2)}, "up must be finite"),
+        ({"pose": np.eye(4)}, "pose_covariance"),
     ],
 )
 def test_wrong_images_are_refused(change, message):

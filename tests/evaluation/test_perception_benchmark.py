@@ -180,6 +180,7 @@ def test_shift_compares_like_with_like():
     found = shift(known, strange)
     assert found["u_ratio_matched"] == pytest.approx(2, rel=0.15)
     assert found["v_ratio_matched"] == pytest.approx(1)
+    assert found["squared_error_ratio_matched"] == pytest.approx(1, rel=0.15)
     assert 0 < found["matched_objects"] < 4000
     assert shift(known, Tally())["u_ratio_matched"] is None
 
