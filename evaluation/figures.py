@@ -121,7 +121,8 @@ def robustness_figure(rows: Sequence[Row]) -> Figure:
         axis.set_xlabel(kind.replace("_", " ") + ", % more")
         axis.set_ylim(0, 1)
     axes[0].set_ylabel("precision (solid), recall (dashed)")
-    axes[0].legend(fontsize=8, frameon=False)
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), fontsize=8, frameon=False)
     return figure
 
 
