@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from ..fusion.tracking import TrackerOptions
 from ..matching import Matching, RelativePose
 from ..matching.bayes import bayes
 from ..matching.metrics import Counts, count, is_correct, pooled
-from ..matching.multiway import consistent, is_consistent
+from ..matching.multiway import Method, consistent, is_consistent
 from ..matching.pose import Array
 from .localization_team import FAULTS, BayesMatches, Fault, Instant, Sight, TrueMatches, instants, play
 from .settings import Settings
@@ -349,23 +349,28 @@ def _team_errors(step: Instant, matchings: dict[tuple[int, int], Matching], team
 
 
 def _consistency_row(steps: Sequence[Instant], matched: Sequence[dict[tuple[int, int], Matching]], n: int) -> Row:
-    """Every robot in turn with the n - 1 that follow it: pairwise matches as they are, and made consistent."""
-    before, after, consistent_frames = [], [], []
+    """Every robot in turn with the n - 1 that follow it: pairwise matches as they are, and made consistent.
+
+    `f1` is that of "joint"; `convex_f1` and `spectral_f1` are those of the other methods.
+    """
+    before, consistent_frames = [], []
+    after: dict[Method, list[Counts]] = {method: [] for method in get_args(Method)}
     for step, matchings in zip(steps, matched, strict=True):
         robots = len(step.views)
         for first in range(robots if n < robots else 1):
             team = sorted((first + k) % robots for k in range(n))
             sizes = [len(step.views[r].detections) for r in team]
             possible = _within(matchings, team)
-            joined = consistent(possible, sizes)
-            consistent_frames.append(is_consistent(joined, sizes))
-            for (a, b), matching in possible.items():
-                names = step.identity[team[a]], step.identity[team[b]]
-                before.append(count(_probable(matching, 0.5), *names))
-                after.append(count(joined[a, b], *names))
-    pairwise, made = pooled(before), pooled(after)
+            names = [step.identity[r] for r in team]
+            before += [count(_probable(m, 0.5), names[a], names[b]) for (a, b), m in possible.items()]
+            for method, counts in after.items():
+                joined = consistent(possible, sizes, method=method)
+                consistent_frames.append(is_consistent(joined, sizes))
+                counts += [count(m, names[a], names[b]) for (a, b), m in joined.items()]
+    pairwise, made = pooled(before), pooled(after["joint"])
     row: Row = {"what": "consistency", "robots": n, "pairwise_f1": pairwise.f1, "f1": made.f1}
     row |= {"pairwise_precision": pairwise.precision, "pairwise_recall": pairwise.recall}
+    row |= {f"{method}_f1": pooled(after[method]).f1 for method in ("convex", "spectral")}
     row |= {"precision": made.precision, "recall": made.recall, "consistent_frames": float(np.mean(consistent_frames))}
     return row
 

@@ -1,8 +1,8 @@
 """Pairwise matchings of N robots made consistent: what a matches with b, and b with c, a matches with c.
 
-`joint`, the default, optimises all groups together under every robot's one-to-one constraint. Like Hu, Huang, Thibert
-and Guibas 2018 (distributable consistent multi-object matching) it matches detections to a common universe of objects,
-robot by robot; it is a combinatorial ascent, not their convex relaxation. `spectral` is the reference (after Pachauri,
+`joint`, the default, optimises all groups together under every robot's one-to-one constraint: a combinatorial ascent,
+robot by robot. `convex` maximises the same sum of log odds over the convex relaxation of Huang and Guibas 2013, which
+Hu, Huang, Thibert and Guibas 2018 distribute (see `multiway_convex`). `spectral` is the reference (after Pachauri,
 Kondor and Singh 2013, and Maset, Arrigoni and Fusiello 2017): leading eigenvectors of the joint match matrix, grouped.
 """
 
@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from .graph import Matching
+from .multiway_convex import ROUND_AT, relaxed
 from .pose import Array
 
+Method = Literal["joint", "convex", "spectral"]
 Pair = tuple[int, int]
 Indices = NDArray[np.int64]
 
@@ -29,7 +31,7 @@ def consistent(
     matchings: Mapping[Pair, Matching],
     sizes: Sequence[int],
     *,
-    method: Literal["joint", "spectral"] = "joint",
+    method: Method = "joint",
     match_prior: float = 0.4,
     min_score: float = 0.0,
 ) -> dict[Pair, Matching]:
@@ -38,7 +40,7 @@ def consistent(
     Args:
         matchings: per pair of robots (i, j), i != j, what a matcher found; scores are match probabilities.
         sizes: number of detections of every robot.
-        method: "joint" (default) or "spectral".
+        method: "joint" (default), "convex" or "spectral".
         match_prior: score that speaks neither for nor against a match. Where two robots were compared and no match was
             made, that speaks mildly against one.
         min_score: matches whose combined score is lower are left out. Above 0 this may open cycles again.
@@ -48,7 +50,8 @@ def consistent(
         robots found it, combined with the support over every third robot: 1 - (1 - s) prod(1 - s_ik s_kj).
 
     Raises:
-        ValueError: a robot or detection out of range, an unknown method, or a prior outside (0, 1).
+        ValueError: a robot or detection out of range, an unknown method, a prior outside (0, 1), or for "convex" more
+            detections in one chain of likely matches than `multiway_convex.MAX_CONNECTED`.
     """
     labels = groups(matchings, sizes, method=method, match_prior=match_prior)
     scores = _joint_scores(matchings, sizes)
@@ -66,7 +69,7 @@ def groups(
     matchings: Mapping[Pair, Matching],
     sizes: Sequence[int],
     *,
-    method: Literal["joint", "spectral"] = "joint",
+    method: Method = "joint",
     match_prior: float = 0.4,
 ) -> list[Indices]:
     """Label of every detection, one array (n_i,) a robot; equal labels are one object, at most one a robot.
@@ -76,10 +79,12 @@ def groups(
     _check(matchings, sizes, match_prior)
     if method == "joint":
         labels = _joint_groups(_affinity(matchings, sizes, match_prior), sizes)
+    elif method == "convex":
+        labels = _convex_groups(_affinity(matchings, sizes, match_prior), sizes)
     elif method == "spectral":
         labels = _spectral_groups(_joint_scores(matchings, sizes), sizes)
     else:
-        raise ValueError(f"method must be 'joint' or 'spectral', got {method!r}")
+        raise ValueError(f"method must be 'joint', 'convex' or 'spectral', got {method!r}")
     _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
     rank = np.empty(len(first), dtype=np.int64)
     rank[np.argsort(first)] = np.arange(len(first))
@@ -108,6 +113,11 @@ def _check(matchings: Mapping[Pair, Matching], sizes: Sequence[int], match_prior
             raise ValueError(f"pair ({i}, {j}) does not name two of {len(sizes)} robots")
         if len(matching) and (matching.pairs.max(axis=0) >= (sizes[i], sizes[j])).any():
             raise ValueError(f"matching ({i}, {j}) speaks of a detection beyond {sizes[i]} and {sizes[j]}")
+
+
+def _robots(sizes: Sequence[int]) -> Indices:
+    """Robot of each detection."""
+    return np.repeat(np.arange(len(sizes)), sizes)
 
 
 def _starts(sizes: Sequence[int]) -> Indices:
@@ -155,8 +165,7 @@ def _joint_groups(L: Array, sizes: Sequence[int], sweeps: int = 20) -> Indices:
     In each sweep one robot's detections leave their groups and are assigned anew, optimally given all others; the
     objective never falls.
     """
-    start = _starts(sizes)
-    robot = np.repeat(np.arange(len(sizes)), sizes)
+    start, robot = _starts(sizes), _robots(sizes)
     labels = _merge(L, robot, len(sizes))
     for _ in range(sweeps):
         before = labels.copy()
@@ -201,12 +210,18 @@ def _merge(L: Array, robot: Indices, robots: int) -> Indices:
     return labels
 
 
+def _convex_groups(L: Array, sizes: Sequence[int]) -> Indices:
+    """Groups from the convex relaxation, cut by greedy merging where X is large."""
+    robot = _robots(sizes)
+    return _merge(relaxed(L, robot) - ROUND_AT, robot, len(sizes))
+
+
 def _spectral_groups(W: Array, sizes: Sequence[int]) -> Indices:
     """Groups from the leading eigenvectors of the joint match matrix, cut by greedy merging of close rows."""
     n = len(W)
     if n == 0:
         return np.zeros(0, dtype=np.int64)
-    robot = np.repeat(np.arange(len(sizes)), sizes)
+    robot = _robots(sizes)
     values, vectors = np.linalg.eigh(W + np.eye(n))
     # With consistent matches the matrix is a sum of blocks of ones: an object seen by k robots has eigenvalue k.
     universe = max(1, round(_universe_size(W, sizes)))

@@ -31,7 +31,18 @@ COLUMNS = {
         "alone_nees_per_dof",
     ),
     "faults": ("fault", "matches", "protections", "precision", "f1", "fused_m", "growth", "nees_per_dof"),
-    "team": ("what", "robots", "fused_m", "fused_median_m", "fused_p95_m", "nees_per_dof", "pairwise_f1", "f1"),
+    "team": (
+        "what",
+        "robots",
+        "fused_m",
+        "fused_median_m",
+        "fused_p95_m",
+        "nees_per_dof",
+        "pairwise_f1",
+        "f1",
+        "convex_f1",
+        "spectral_f1",
+    ),
 }
 
 
