@@ -28,8 +28,9 @@ Where the text does not determine a method that works, this file chooses, and sa
 from __future__ import annotations
 
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 from numba import njit
@@ -354,9 +355,19 @@ def parallel_chains(
         annealing.add_probability,
         annealing.proposal_width,
     )
-    with ProcessPoolExecutor(workers) as pool:
-        results = list(pool.map(_solve_one, [problem] * workers, [job] * workers, rng.spawn(workers)))
+    try:
+        results = list(_pool(workers).map(_solve_one, [problem] * workers, [job] * workers, rng.spawn(workers)))
+    except BrokenProcessPool:
+        # Not to be met again by the next call.
+        _pool.cache_clear()
+        raise
     return max(results, key=lambda result: result[1])
+
+
+@lru_cache(maxsize=1)
+def _pool(workers: int) -> ProcessPoolExecutor:
+    """The processes of `parallel_chains`, kept from call to call: starting them costs more than a match."""
+    return ProcessPoolExecutor(workers)
 
 
 def _solve_one(problem: Problem, annealing: Annealing, rng: np.random.Generator) -> tuple[NDArray[np.int64], float]:

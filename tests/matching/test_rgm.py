@@ -1,5 +1,7 @@
 """Algorithm 1: the chain against its enumerated distribution, the result against the brute-force optimum."""
 
+import os
+from concurrent.futures.process import BrokenProcessPool
 from importlib import import_module
 from itertools import permutations
 
@@ -154,6 +156,17 @@ def test_workers_share_the_proposals():
     two = rgm(source, target, proposals=200, workers=2)
     assert two.diagnostics["log_p"] >= 0.8 * one.diagnostics["log_p"] > 0
     assert sum(truth.get(int(a)) == b for a, b in two.pairs) > len(two) / 2
+
+
+def test_a_lost_process_costs_one_call():
+    source, target, _ = scene(np.random.default_rng(1))
+    expected = rgm(source, target, rng=np.random.default_rng(0), proposals=40, workers=2)
+    lost = solver._pool(2).submit(os._exit, 1)
+    assert isinstance(lost.exception(), BrokenProcessPool)
+    with pytest.raises(BrokenProcessPool):
+        rgm(source, target, proposals=40, workers=2)
+    again = rgm(source, target, rng=np.random.default_rng(0), proposals=40, workers=2)
+    assert again.pairs.tolist() == expected.pairs.tolist()
 
 
 def test_reject_mirrored_tells_a_scene_from_its_reflection():
