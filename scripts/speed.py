@@ -22,6 +22,7 @@ AREAS = {
     "fusion": ("speed_fusion", None),
     "perception": ("speed_perception", "learned"),
 }
+MEMORY: dict[str, str] = {"envs": "memory_envs", "matching": "memory_matching"}
 
 
 def speed(
@@ -29,18 +30,21 @@ def speed(
     json_target: Annotated[str | None, typer.Option("--json", help="Write rows to FILE; - prints them.")] = None,
     figure: Annotated[Path | None, typer.Option(help="matching: figure of time and memory against size.")] = None,
     memory: Annotated[
-        bool, typer.Option("--memory", help="envs: growth over resets and steps instead, a process per scene.")
+        bool,
+        typer.Option(
+            "--memory", help="Instead: envs, growth over resets and steps; matching, peak at the largest size accepted."
+        ),
     ] = False,
-    resets: Annotated[int, typer.Option(help="--memory: resets of each scene.")] = 1_000,
-    steps: Annotated[int, typer.Option(help="--memory: steps of each scene.")] = 100_000,
+    resets: Annotated[int, typer.Option(help="envs --memory: resets of each scene.")] = 1_000,
+    steps: Annotated[int, typer.Option(help="envs --memory: steps of each scene.")] = 100_000,
 ) -> None:
     """Rates per second against peers, side by side in this process, on one thread."""
-    if memory and area != "envs":
-        fail(f"--memory is for envs, not for {area}")
-    if figure is not None and area != "matching":
-        fail(f"--figure is for matching, not for {area}")
     if area not in AREAS:
         fail(f"no area is called {area!r}; there are {', '.join(AREAS)}")
+    if memory and area not in MEMORY:
+        fail(f"--memory is for {' and '.join(MEMORY)}, not for {area}")
+    if figure is not None and (memory or area != "matching"):
+        fail(f"--figure is for matching without --memory, not for {area}{' --memory' if memory else ''}")
     module, extra = AREAS[area]
     # Before the libraries that read them are imported.
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
@@ -49,7 +53,8 @@ def speed(
         if extra is not None:
             require(extra)
         if memory:
-            measure = partial(import_module("covis.evaluation.memory_envs").rows, resets=resets, steps=steps)
+            measure = import_module(f"covis.evaluation.{MEMORY[area]}").rows
+            measure = partial(measure, resets=resets, steps=steps) if area == "envs" else measure
         else:
             measure = import_module(f"covis.evaluation.{module}").rows
         if figure is not None:

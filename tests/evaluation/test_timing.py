@@ -4,7 +4,8 @@ import time
 
 import pytest
 
-from covis.evaluation.memory_matching import STATUS, add_memory
+from covis.evaluation import memory_matching
+from covis.evaluation.memory_matching import STATUS, add_memory, peak_at_largest
 from covis.evaluation.timing import rates, row
 
 
@@ -34,6 +35,22 @@ def test_a_quadratic_affinity_shows_in_memory():
     assert rrwm["memory_mib"] > reid["memory_mib"] + 5
 
 
+@pytest.mark.skipif(not STATUS.exists(), reason="the operating system does not tell a process's peak memory")
+def test_peak_is_taken_at_the_largest_size_that_is_not_refused(monkeypatch):
+    refused = []
+
+    def peak(method, n, *, one_class):
+        assert one_class
+        if n > 17:
+            refused.append(n)
+            raise ValueError("too many")
+        return 3.5
+
+    monkeypatch.setattr(memory_matching, "peak_mib", peak)
+    assert peak_at_largest("rrwhm") == (17, 3.5)
+    assert refused == list(range(200, 17, -1))
+
+
 @pytest.mark.skipif(not STATUS.exists(), reason="the operating system does not tell a process's memory")
 def test_memory_of_an_environment_counts_its_steps_and_files():
     pytest.importorskip("pybullet")
@@ -52,14 +69,14 @@ def test_memory_refuses_nothing_to_do():
         memory_envs.rows(resets=0)
 
 
-def test_memory_is_for_environments():
+def test_memory_is_for_environments_and_matching():
     from typer.testing import CliRunner
 
     from covis.scripts.main import app
 
-    result = CliRunner().invoke(app, ["speed", "matching", "--memory"])
+    result = CliRunner().invoke(app, ["speed", "fusion", "--memory"])
     assert result.exit_code == 2
-    assert "--memory is for envs" in result.stderr
+    assert "--memory is for envs and matching" in result.stderr
 
 
 def test_speed_refuses_unknown_areas():
