@@ -149,14 +149,14 @@ def sparse(K: Array) -> tuple[NDArray[np.int64], NDArray[np.int32], Array]:
         for b in range(k):
             count += K[a, b] > least
         start[a + 1] = start[a] + count
-    column, value = np.empty(start[k], dtype=np.int32), np.empty(start[k])
+    # Every entry is written and the next overwrites it if negligible: branches would be guessed wrongly too often.
+    column, value = np.empty(start[k] + 1, dtype=np.int32), np.empty(start[k] + 1)
     for a in range(k):
         at = start[a]
         for b in range(k):
-            if K[a, b] > least:
-                column[at], value[at] = b, K[a, b]
-                at += 1
-    return start, column, value
+            column[at], value[at] = b, K[a, b]
+            at += K[a, b] > least
+    return start, column[:-1], value[:-1]
 
 
 @njit(cache=True, fastmath=True)
@@ -165,8 +165,9 @@ def multiply(start: NDArray[np.int64], column: NDArray[np.int32], value: Array, 
     out = np.empty(len(x))
     for a in range(len(x)):
         total = 0.0
-        for at in range(start[a], start[a + 1]):
-            total += value[at] * x[column[at]]
+        # Unsigned, since an index that might count from the end keeps the compiler from using vector instructions.
+        for at in range(np.uint64(start[a]), np.uint64(start[a + 1])):
+            total += value[at] * x[np.uint64(column[at])]
         out[a] = total
     return out
 
