@@ -26,12 +26,14 @@ def match_pair(
     stream: tuple[int, ...],
     where: str,
     tracker: PairTracker | None = None,
+    maps: tuple[ObjectGraph, ObjectGraph] | None = None,
 ) -> tuple[Matching, float]:
     """The matching and the time it took, ms.
 
     `identities` serve the evaluation-only baselines alone. `stream` seeds the matcher's generator, together with the
     method's name, so that results depend on neither the order of methods nor the number of workers. A `tracker`, after
-    its `predict`, calls the matcher itself and hands it what it knows of the relative pose.
+    its `predict`, calls the matcher itself and hands it what it knows of the relative pose; `maps` are what both robots
+    remember, not used where the method sees disturbed graphs.
 
     Raises:
         PriorRequiredError: the method needs a prior.
@@ -46,12 +48,13 @@ def match_pair(
     assert matcher is not None
     if method.disturbance.rates():
         source, target = disturbed(method, source, target, stream)
+        maps = None
     start = perf_counter()
     try:
         if tracker is None:
             matching = matcher(source, target, prior=prior, rng=rng, **method.options)
         else:
-            matching = tracker.match(matcher, source, target, rng=rng, **method.options)
+            matching = tracker.match(matcher, source, target, maps=maps, rng=rng, **method.options)
     except PriorRequiredError:
         raise
     except Exception as error:

@@ -185,7 +185,8 @@ def _dataset_moments(
         for i in chunk.tolist():
             frame = dataset.frame(i)
             if trackers is not None:
-                trackers.begin(frame.episode, {view.robot: view.odometry for view in frame.views})
+                odometry = {view.robot: view.odometry for view in frame.views}
+                trackers.begin(frame.episode, odometry, {view.robot: view.graph for view in frame.views})
             sightings = tuple(pictures.sighting(frame.index, view) for view in frame.views)
             results = {m.label: judge(sightings, _match(dataset, frame, m, settings, trackers)) for m in methods}
             yield Moment(frame.index, frame.episode, frame.time, sightings, _things(sightings), results)
@@ -207,6 +208,7 @@ def _match(
             (settings.seed, frame.index, i * len(frame.views) + j),
             f"{dataset.name}, frame {frame.index}, {source.robot} and {target.robot}",
             None if trackers is None else trackers.of(method.label, source.robot, target.robot),
+            None if trackers is None else trackers.maps(source.robot, target.robot),
         )
     return found
 

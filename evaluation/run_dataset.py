@@ -46,7 +46,8 @@ def run_frames(
     trackers = PairTrackers() if settings.sequence else None
     for frame in frames:
         if trackers is not None:
-            trackers.begin(frame.episode, {view.robot: view.odometry for view in frame.views})
+            odometry = {view.robot: view.odometry for view in frame.views}
+            trackers.begin(frame.episode, odometry, {view.robot: view.graph for view in frame.views})
         found: list[tuple[Record, NDArray[np.int64]]] = []
         for pair in pairs(frame, 0 if trackers is not None else settings.min_common):
             matched = list(_match_all(name, pair, methods, settings, trackers))
@@ -98,6 +99,7 @@ def _match_all(
             (settings.seed, frame.index, number),
             where,
             None if trackers is None else trackers.of(method.label, source.robot, target.robot),
+            None if trackers is None else trackers.maps(source.robot, target.robot),
         )
         record = Record.of_matching(
             matching,

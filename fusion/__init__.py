@@ -5,6 +5,7 @@ from covis.fusion import fuse, fuse_own, register
 
 from .channel import Channel, ChannelOptions
 from .gaussian import Gaussian, covariance_intersection, fuse_gaussians, fuse_isotropic, fused_variance, fusion_gains
+from .localmap import LocalMap, MapOptions
 from .member import UNPROTECTED, Localized, Member, MemberOptions, Report
 from .objects import (
     FusedObjects,
@@ -30,7 +31,9 @@ __all__ = [
     "FusedObjects",
     "Gaussian",
     "Groups",
+    "LocalMap",
     "Localized",
+    "MapOptions",
     "Member",
     "MemberOptions",
     "OwnObjects",

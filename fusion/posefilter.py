@@ -145,19 +145,23 @@ class PoseFilter:
             self.covariances = self.covariances + swing
         self.means[:, 3] = wrap(self.means[:, 3])
 
-    def update(self, means: Array, covariances: Array, probabilities: Array) -> Choice:
+    def update(
+        self, means: Array, covariances: Array, probabilities: Array, independence: float | None = None
+    ) -> Choice:
         """Take in one frame's hypotheses.
 
         Args:
             means: (h, 4), covariances: (h, 4, 4): proposed poses, levelled.
             probabilities: (h,) of each under a flat prior; what is missing to 1 stands for "none of these".
+            independence: share of this evidence that is new; None = as in the options.
         """
         o = self.options
+        share = o.independence if independence is None else independence
         k, h = len(self.weights), len(means)
         p = np.asarray(probabilities, dtype=np.float64) * (1 - o.overlooked)
         none = max(1.0 - float(p.sum()), o.overlooked)
-        p, none = p**o.independence, none**o.independence
-        C_new = covariances / o.independence + np.diag([1e-6, 1e-6, 1e-4, 1e-8])
+        p, none = p**share, none**share
+        C_new = covariances / share + np.diag([1e-6, 1e-6, 1e-4, 1e-8])
         if k == 0 and h == 0:
             return Choice(0.0, -1, -1)
         log_volume = float(np.log(o.extent_m**2 * 2.0 * 2 * np.pi))
@@ -168,7 +172,7 @@ class PoseFilter:
         W = np.linalg.inv(S)
         squared = np.einsum("khi,khij,khj->kh", innovation, W, innovation)
         log_overlap = -0.5 * (squared + np.linalg.slogdet(S)[1]) - 2.0 * LOG_2PI + log_volume
-        both = self.weights[:, None] * p[None] * np.exp(np.minimum(log_overlap, 500.0) * o.independence)
+        both = self.weights[:, None] * p[None] * np.exp(np.minimum(log_overlap, 500.0) * share)
         kept = self.weights * none
         born = self.unknown * p
         still_unknown = self.unknown * none

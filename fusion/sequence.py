@@ -31,6 +31,8 @@ class PairOptions:
         widen: factor on the covariance of a prior without odometry; above 1 because errors of successive views are
             alike, and because cars turn faster than persistence expects.
         min_registered: matches a matcher without poses must give for one to be estimated.
+        map_independence: share of what matching the local maps says in a frame that is new.
+        beside_maps: in place of the filter's `independence` for views matched beside maps, which hold them too.
     """
 
     filter: PoseFilterOptions = field(default_factory=PoseFilterOptions)
@@ -38,6 +40,8 @@ class PairOptions:
     refuse: float = 0.3
     widen: float = 4.0
     min_registered: int = 4
+    map_independence: float = 0.05
+    beside_maps: float = 0.1
 
 
 class PairTracker:
@@ -48,7 +52,8 @@ class PairTracker:
         tracker.predict(odometry_source, odometry_target)
         matching = tracker.match(matcher, source, target)
 
-    or only ask for the prior and report what came of it:
+    where `match` also takes both robots' local maps, which it matches with each other first; or only ask for the prior
+    and report what came of it:
 
         prior = tracker.prior(odometry_source, odometry_target)
         matching = matcher(source, target, prior=prior)
@@ -114,10 +119,11 @@ class PairTracker:
         source: ObjectGraph,
         target: ObjectGraph,
         *,
+        maps: tuple[ObjectGraph, ObjectGraph] | None = None,
         rng: np.random.Generator | None = None,
         **options: Any,
     ) -> Matching:
-        """This frame's matching, after `predict`."""
+        """This frame's matching, after `predict`; `maps` are all that either robot remembers (`LocalMap.see`)."""
         alone = matcher(source, target, prior=None, rng=rng, **options)
         if source.up is None or target.up is None:
             return alone
@@ -125,9 +131,12 @@ class PairTracker:
             self._carry(source.up, target.up)
         self._pending.clear()
         self._ups = (source.up, target.up)
+        if maps is not None:
+            found = propose(*maps, matcher(*maps, prior=None, rng=rng, **options), self.options.min_registered)
+            self._absorb(found, self.options.map_independence)
         before = [(m, C) for m, C in zip(self.filter.means, self.filter.covariances, strict=True)]
         found = propose(source, target, alone, self.options.min_registered)
-        choice = self._absorb(found)
+        choice = self._absorb(found, None if maps is None else self.options.beside_maps)
         if choice.probability < self.options.trust:
             return _believed(alone, choice.probability, self.options.refuse)
         if choice.component >= 0:
@@ -162,12 +171,12 @@ class PairTracker:
                 None if target is None else level_motion(target, before_t, after_t),
             )
 
-    def _absorb(self, found: list[tuple[RelativePose, float]]) -> Choice:
+    def _absorb(self, found: list[tuple[RelativePose, float]], independence: float | None = None) -> Choice:
         assert self._ups is not None
         levelled = [to_levelled(pose, *self._ups) for pose, _ in found]
         means = np.array([m for m, _ in levelled]).reshape(-1, 4)
         covariances = np.array([C for _, C in levelled]).reshape(-1, 4, 4)
-        return self.filter.update(means, covariances, np.array([p for _, p in found]))
+        return self.filter.update(means, covariances, np.array([p for _, p in found]), independence)
 
 
 def _believed(matching: Matching, probability: float, refuse: float) -> Matching:
