@@ -7,7 +7,7 @@ seen again puts all the others right. The robot stays at the origin; what moves 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -182,7 +182,7 @@ class LocalMap:
     def _compare(self, fit: _Fit, seen: Array, R: Array) -> tuple[Array, Array, Array]:
         """Of every detection with every landmark: cost (n, k), inf where impossible; offset; inverse covariance."""
         off = seen[:, None] - fit.positions
-        W = np.linalg.inv(R[:, None] + _blocks(fit.covariance))
+        W: Array = np.asarray(np.linalg.inv(R[:, None] + _blocks(fit.covariance)), dtype=np.float64)
         squared = np.einsum("nki,nkij,nkj->nk", off, W, off)
         possible = squared < self.options.gate
         possible[fit.landmark >= 0] = False
@@ -236,7 +236,7 @@ def _blocks(covariance: Array) -> Array:
 def _joined(first: ObjectGraph, second: ObjectGraph) -> ObjectGraph:
     """The objects of both."""
     names = ("positions", "attributes", "position_variance", "attribute_variance")
-    arrays = {name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in names}
+    arrays: dict[str, Any] = {name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in names}
     embedding = None
     if first.embedding is not None and second.embedding is not None:
         embedding = np.concatenate([first.embedding, second.embedding])
