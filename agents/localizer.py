@@ -12,9 +12,13 @@ import numpy as np
 from ..envs.claims import Claims
 from ..fusion.objects import GAINS, Gain, fuse_own, group_detections
 from ..matching import Matcher, Matching, RelativePose, load_matcher
+from ..matching.multiway import consistent
 from .perception.detections import Detections, Perceptor
 
 Matchings = dict[tuple[int, int], Matching]
+
+GATE = 0.999
+"""Share of honest differences between two robots' measurements that stays; the others are wrong matches."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,12 +104,14 @@ def claims(views: Sequence[View], matchings: Matchings, max_detections: int, gai
     """What every robot asserts: its boxes, its matches, its detections' positions alone and fused."""
     graphs = [view.detections.graph for view in views]
     poses = {(i, j): relative_pose(views[i], views[j]) for i, j in combinations(range(len(views)), 2)}
-    groups = group_detections([len(g) for g in graphs], matchings)
+    sizes = [len(g) for g in graphs]
+    groups = group_detections(sizes, consistent(matchings, sizes) if len(views) > 2 else matchings)
+    gate = None if gain == "paper" else GATE
     out = []
     for i, view in enumerate(views):
         n = len(view.detections)
         claim = Claims.empty(max_detections, len(views) - 1)
-        own = fuse_own(graphs, poses, groups, i, gain=gain, frame_covariance=view.pose_covariance)
+        own = fuse_own(graphs, poses, groups, i, gain=gain, gate=gate, frame_covariance=view.pose_covariance)
         claim.boxes[:n] = view.detections.boxes
         claim.positions[:n] = own.positions
         claim.positions_single[:n] = own.positions_single

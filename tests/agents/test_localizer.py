@@ -41,6 +41,21 @@ def test_matches_are_told_to_both_robots_under_their_own_numbering(scene):
     assert (said[1].matches == 32).all()
 
 
+def test_a_match_that_the_poses_contradict_is_claimed_but_not_fused(scene):
+    env, observations = scene
+    views = Localizer(SimulatedPerception(env.world.classes), "reid").look(observations, np.random.default_rng(0))
+    T = relative_pose(views[0], views[1]).T_source_target
+    own = views[0].detections.graph.positions
+    partner = views[1].detections.graph.positions @ T[:3, :3].T + T[:3, 3]
+    a, b = np.unravel_index(np.linalg.norm(own[:, None] - partner, axis=2).argmax(), (len(own), len(partner)))
+    matchings = {(0, 1): Matching([[a, b]], [0.9])}
+    gated = claims(views, matchings, 32)[0]
+    assert gated.matches[0, a] == b
+    assert min(np.linalg.norm(gated.positions[a] - x) for x in (own[a], partner[b])) < 1e-6
+    blended = claims(views, matchings, 32, "paper")[0].positions[a]
+    assert min(np.linalg.norm(blended - x) for x in (own[a], partner[b])) > 0.1
+
+
 def test_fewer_slots_keep_the_largest_boxes(scene):
     env, observations = scene
     localizer = Localizer(SimulatedPerception(env.world.classes), "reid", max_detections=2)
