@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import sys
 from pathlib import Path
 
 from typer.testing import CliRunner
@@ -18,6 +19,9 @@ def test_the_example_runs_as_printed(tmp_path, monkeypatch):
     (tmp_path / "mine.py").write_text(code)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
+    # Other pages have a mine.py of their own: forget theirs now, and this one afterwards.
+    monkeypatch.setitem(sys.modules, "mine", None)
+    del sys.modules["mine"]
     result = CliRunner().invoke(app, shlex.split(command))
     assert result.exit_code == 0, result.output
     assert result.stdout.count("mine:match:height_m=0.3") == 3  # in every experiment of the suite
