@@ -45,7 +45,7 @@ docs: $(STAMP)
 	$(if $(SERVE),$(BIN)/python -m http.server --bind 127.0.0.1 --directory build/site 8000)
 
 # Everything under docs/results: hours on two cores. Interrupted, it goes on where it was; runs/ keeps the records.
-# `make results EPISODES=1` is a rehearsal. Solves are timed one at a time.
+# `make results EPISODES=1` is a rehearsal. page.html, since the site makes a report.html of report.md. Solves are timed one at a time.
 SUITES ?= paper-table1 paper-case-study paper-fig7 matching-synthetic scaling-robots paper-runtime
 WORKERS ?= 2
 results: $(STAMP)
@@ -55,7 +55,8 @@ results: $(STAMP)
 	  $(BIN)/covis benchmark $$suite --out runs/$$suite --resume --workers $$workers $(if $(EPISODES),--episodes $(EPISODES)) \
 	    --figure docs/results/$$suite/figure.png && \
 	  $(BIN)/covis report runs/$$suite && \
-	  cp runs/$$suite/rows.json runs/$$suite/report.md runs/$$suite/report.html docs/results/$$suite/ || exit 1; \
+	  cp runs/$$suite/rows.json runs/$$suite/report.md docs/results/$$suite/ && \
+	  cp runs/$$suite/report.html docs/results/$$suite/page.html || exit 1; \
 	done
 
 clean:
