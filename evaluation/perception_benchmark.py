@@ -157,16 +157,18 @@ def perception_benchmark(
         raise MissingExtraError("pycocotools is missing: install covis[learned]")
     from ..agents.perception import weights as stored
     from ..agents.perception.frames import TEST_KEY
+    from ..agents.perception.learned import LearnedPerceptionParams, dense_type
 
     weights = stored.load() if weights is None else weights
     key = TEST_KEY if split_key is None else split_key
     targets = default_targets() if targets is None else targets
     tallies: dict[PerceptionTarget, Tally] = {}
     rows = []
+    computed = {"precision": str(dense_type(LearnedPerceptionParams().precision)).removeprefix("torch.")}
     for n, target in enumerate(targets):
         part = partial(_part_of, progress, n, images, len(targets))
         tallies[target] = tally(target, weights, images, (key, seed), samples, part)
-        rows.append(row(target, tallies[target]) | {"images": tallies[target].images, "seed": seed})
+        rows.append(row(target, tallies[target]) | {"images": tallies[target].images, "seed": seed} | computed)
         known = PerceptionTarget(target.scene)
         if target.ood and known in tallies:
             rows[-1] |= shift(tallies[known], tallies[target])

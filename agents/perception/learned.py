@@ -35,6 +35,9 @@ from .network import (
 )
 
 
+PRECISIONS = ("auto", "bfloat16", "float32")
+
+
 @dataclass(frozen=True)
 class LearnedPerceptionParams:
     """How the network's outputs become detections.
@@ -46,6 +49,8 @@ class LearnedPerceptionParams:
         min_pixels: least visible pixels of a detection.
         depth_pixels: pixels per object over which depth is averaged, spread evenly over its mask.
         max_iou, max_inside: a mask goes when a better one overlaps it more, see `decode.suppress`.
+        precision: of the part that runs once per image, in which it was trained as well: `bfloat16`, `float32`, or
+            `auto`, which is bfloat16 where the processor multiplies such numbers (twice as fast) and float32 elsewhere.
     """
 
     samples: int = 16
@@ -55,6 +60,7 @@ class LearnedPerceptionParams:
     depth_pixels: int = 12
     max_iou: float = 0.5
     max_inside: float = 0.75
+    precision: str = "auto"
 
     def __post_init__(self) -> None:
         for name in ("samples", "candidates", "min_pixels", "depth_pixels"):
@@ -64,6 +70,8 @@ class LearnedPerceptionParams:
         for name in ("score", "max_iou", "max_inside"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)}")
+        if self.precision not in PRECISIONS:
+            raise ValueError(f"precision must be one of {', '.join(PRECISIONS)}, got {self.precision!r}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +138,7 @@ class LearnedPerception:
         self.last: Seen | None = None
 
     def _build(self, weights: stored.Weights) -> nn.Module:
-        return build(weights)
+        return build(weights, dense_type(self.params.precision))
 
     @classmethod
     def from_folder(cls, folder: Path, classes: Sequence[str], **options: Any) -> LearnedPerception:
@@ -394,12 +402,21 @@ class Clock:
         self._since = now
 
 
-def build(weights: stored.Weights) -> Eyes:
-    """The network of these weights, for inference: normalisation folded into the convolutions."""
+def dense_type(precision: str) -> torch.dtype:
+    """The type that `LearnedPerceptionParams.precision` stands for on this machine."""
+    if precision == "auto":
+        native = getattr(torch.cpu, "get_capabilities", dict)()  # older torch has none, and is not asked
+        precision = "bfloat16" if native.get("avx512_bf16") or native.get("amx_bf16") else "float32"
+    return torch.bfloat16 if precision == "bfloat16" else torch.float32
+
+
+def build(weights: stored.Weights, dense: torch.dtype = torch.float32) -> Eyes:
+    """The network of these weights, for inference: normalisation folded into the convolutions, then the dense part cast."""
     network = Eyes(NetworkParams.from_dict(dict(weights.network)))
     network.load_state_dict(dict(weights.tensors))
     network.eval().requires_grad_(False)
     _fold(network)
+    network.dense_to(dense)
     return network.to(memory_format=torch.channels_last)
 
 

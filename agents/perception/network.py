@@ -26,6 +26,18 @@ STRIDES = (4, 8, 16)
 """Of the features that the heads read."""
 FINE_STRIDE = 2
 """Of heat map and masks."""
+DENSE_PARTS = (
+    "stem",
+    "stages",
+    "context",
+    "lateral",
+    "smooth",
+    "to_heat",
+    "to_fine",
+    "from_stem",
+    "mask_mix",
+)
+"""Attributes of `Eyes` that run once per image; the others run per object."""
 GEOMETRY_CHANNELS = 4
 REFERENCE_FOCAL_PX = 200.0
 CENTRE_GEOMETRY = 3
@@ -213,9 +225,15 @@ class Eyes(nn.Module):
         with torch.no_grad():
             self.depth_out.bias.copy_(torch.tensor([2.0, -2.0]))
 
+    def dense_to(self, dtype: torch.dtype) -> None:
+        """Let the part that runs once per image compute in `dtype`; the heads stay as they are."""
+        for name in DENSE_PARTS:
+            getattr(self, name).to(dtype)
+
     def forward(self, image: Tensor, geometry: Geometry) -> DenseFeatures:
-        """Dense features of images (b, 3, H, W) in [-1, 1]."""
-        x = torch.cat([image, geometry.maps(*image.shape[2:])], dim=1).contiguous(memory_format=torch.channels_last)
+        """Dense features of images (b, 3, H, W) in [-1, 1], float32 whatever the part that runs once computes in."""
+        x = torch.cat([image, geometry.maps(*image.shape[2:])], dim=1)
+        x = x.to(self.lateral[0].weight.dtype, memory_format=torch.channels_last)
         stem = self.stem(x)
         levels, y = [], stem
         for stage in self.stages:

@@ -21,7 +21,7 @@ from covis.agents.perception.decode import (  # noqa: E402
     suppress,
 )
 from covis.agents.perception.kinds import kind, open_eyes  # noqa: E402
-from covis.agents.perception.learned import LearnedPerception, LearnedPerceptionParams, camera_height  # noqa: E402
+from covis.agents.perception.learned import LearnedPerception, LearnedPerceptionParams, build, camera_height  # noqa: E402
 from covis.agents.perception.network import (  # noqa: E402
     Eyes,
     Geometry,
@@ -309,7 +309,7 @@ def test_calibration_scales_the_reported_variance():
 
 
 def test_folding_the_normalisation_changes_nothing():
-    look = eyes()
+    folded = build(tiny_weights())
     plain = Eyes(TINY)
     plain.load_state_dict(tiny_weights().tensors)
     plain.eval()
@@ -320,7 +320,7 @@ def test_folding_the_normalisation_changes_nothing():
     )
     with torch.inference_mode():
         x = normalised(torch.from_numpy(seen["image"][None]))
-        torch.testing.assert_close(look.network(x, geometry).mask, plain(x, geometry).mask, atol=1e-4, rtol=1e-4)
+        torch.testing.assert_close(folded(x, geometry).mask, plain(x, geometry).mask, atol=1e-4, rtol=1e-4)
 
 
 def test_an_image_without_objects_gives_an_empty_graph():
@@ -437,6 +437,19 @@ def test_fewer_than_one_sample_is_refused(samples):
         LearnedPerceptionParams(samples=samples)
 
 
+def test_an_unknown_precision_is_refused():
+    with pytest.raises(ValueError, match="precision must be one of auto, bfloat16, float32, got 'int8'"):
+        LearnedPerceptionParams(precision="int8")
+
+
+def test_only_what_runs_once_per_image_computes_in_bfloat16():
+    params = LearnedPerceptionParams(precision="bfloat16")
+    types = {name: p.dtype for name, p in LearnedPerception(CLASSES, tiny_weights(), params).network.named_parameters()}
+    heads = ("object_", "class_", "depth_")
+    assert {t for name, t in types.items() if name.startswith(heads)} == {torch.float32}
+    assert {t for name, t in types.items() if not name.startswith(heads)} == {torch.bfloat16}
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -466,10 +479,12 @@ def test_a_wrong_size_or_no_image_is_refused():
 @pytest.mark.skipif(
     not (stored.SHIPPED / stored.MANIFEST).is_file() or not STORED.is_file(), reason="no weights in this tree"
 )
-def test_shipped_weights_reproduce_a_stored_prediction():
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_shipped_weights_reproduce_a_stored_prediction(precision):
     with np.load(STORED) as kept:
         seen = {name: kept[name] for name in ("image", "intrinsics", "up", "pose", "pose_covariance")}
-        look = LearnedPerception(kept["classes"].tolist(), params=LearnedPerceptionParams(samples=1))
+        params = LearnedPerceptionParams(samples=1, precision=precision)
+        look = LearnedPerception(kept["classes"].tolist(), params=params)
         found = look(seen, np.random.default_rng(0))
         assert len(found) == len(kept["positions"]) > 3
         np.testing.assert_allclose(found.graph.positions, kept["positions"], rtol=0.02, atol=0.02)
