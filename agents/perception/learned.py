@@ -34,7 +34,6 @@ from .network import (
     normalised,
 )
 
-
 PRECISIONS = ("auto", "bfloat16", "float32")
 
 
@@ -405,13 +404,13 @@ class Clock:
 def dense_type(precision: str) -> torch.dtype:
     """The type that `LearnedPerceptionParams.precision` stands for on this machine."""
     if precision == "auto":
-        native = getattr(torch.cpu, "get_capabilities", dict)()  # older torch has none, and is not asked
+        native: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()  # older torch: none
         precision = "bfloat16" if native.get("avx512_bf16") or native.get("amx_bf16") else "float32"
     return torch.bfloat16 if precision == "bfloat16" else torch.float32
 
 
 def build(weights: stored.Weights, dense: torch.dtype = torch.float32) -> Eyes:
-    """The network of these weights, for inference: normalisation folded into the convolutions, then the dense part cast."""
+    """The network of these weights, for inference: normalisation folded into the convolutions, dense part cast."""
     network = Eyes(NetworkParams.from_dict(dict(weights.network)))
     network.load_state_dict(dict(weights.tensors))
     network.eval().requires_grad_(False)
