@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..matching.pose import Array
-from .perception_benchmark import PerceptionTarget, default_targets, make_env, test_images
+from .perception_images import PerceptionTarget, default_targets, make_env, test_images
 
 if TYPE_CHECKING:
     from ..agents.perception.detections import Detections

@@ -11,7 +11,9 @@ import numpy as np
 from scipy.optimize import minimize
 
 from ..matching.pose import Array
-from .perception_benchmark import PerceptionTarget, Tally, default_targets, row, tally
+from .perception_benchmark import row
+from .perception_images import PerceptionTarget, default_targets
+from .perception_tally import Tally, tally
 
 if TYPE_CHECKING:
     from torch import nn

@@ -4,20 +4,9 @@ import numpy as np
 import pytest
 
 from covis.agents.perception.weights import Calibration, variance_features
-from covis.evaluation.perception_benchmark import (
-    MIN_PIXELS,
-    CocoRecords,
-    PerceptionTarget,
-    Tally,
-    count,
-    ence,
-    exact_spearman,
-    match_masks,
-    perception_benchmark,
-    row,
-    shift,
-    spearman,
-)
+from covis.evaluation.perception_benchmark import ence, exact_spearman, perception_benchmark, row, shift, spearman
+from covis.evaluation.perception_images import PerceptionTarget
+from covis.evaluation.perception_tally import MIN_PIXELS, CocoRecords, Tally, count, match_masks
 from covis.evaluation.perception_training import calibrate
 from covis.matching import ObjectGraph
 
@@ -203,7 +192,7 @@ def test_counting_one_image():
     pytest.importorskip("pycocotools")
     from covis.agents.perception.detections import Detections
     from covis.agents.perception.learned import Seen
-    from covis.evaluation.perception_benchmark import Image
+    from covis.evaluation.perception_images import Image
 
     instances, masks, pixels = scene()
     centres = np.array([[0.0, 0, 4], [1, 0, 5], [0, 0, 9]])
