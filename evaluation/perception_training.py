@@ -18,7 +18,7 @@ from .perception_tally import Tally, tally
 if TYPE_CHECKING:
     from torch import nn
 
-    from ..agents.perception.training import State, TrainingParams
+    from ..agents.perception.training_step import State, TrainingParams
     from ..agents.perception.weights import Calibration, Weights
 
 FIGURES = ("ap50", "class_accuracy", "depth_abs_rel", "depth_spearman", "ence")

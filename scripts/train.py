@@ -45,7 +45,8 @@ def perception(
         require("torchvision" if network == "maskrcnn" else "learned")
         import torch
 
-        from ..agents.perception.training import TrainingParams, train
+        from ..agents.perception.training import train
+        from ..agents.perception.training_step import TrainingParams
         from ..evaluation.perception_training import finish, validation_figures
 
         torch.set_num_threads(1)

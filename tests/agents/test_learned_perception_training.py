@@ -12,14 +12,15 @@ from covis.agents.perception import frames as source  # noqa: E402
 from covis.agents.perception.frames import FrameSource, Variant, training_variants  # noqa: E402
 from covis.agents.perception.losses import LossWeights, iou, losses, make_batch, overlap_loss  # noqa: E402
 from covis.agents.perception.network import Eyes, NetworkParams  # noqa: E402
-from covis.agents.perception.training import (  # noqa: E402
+from covis.agents.perception.training import train  # noqa: E402
+from covis.agents.perception.training_step import (  # noqa: E402
     CHECKPOINT,
     Pool,
     TrainingParams,
     fresh,
     load_checkpoint,
+    save_checkpoint,
     schedule,
-    train,
     train_step,
 )
 
@@ -185,8 +186,6 @@ def test_resuming_gives_what_an_unbroken_training_gives(tmp_path):
 def test_steps_go_on_bit_for_bit_after_loading(tmp_path):
     params = quick(bf16=False)
     pool = Pool(FrameSource(variants=ROBOTS), params.pool_chunks)
-    from covis.agents.perception.training import save_checkpoint
-
     one = fresh(params, tiny())
     train_step(one, pool, params, 0.1)
     save_checkpoint(tmp_path / CHECKPOINT, one)
@@ -250,6 +249,26 @@ def test_two_workers_average_their_weights(tmp_path):
     alone = train(quick(steps=2), tmp_path / "alone", network=tiny())
     pairs = zip(state.network.parameters(), alone.network.parameters(), strict=True)
     assert any((a != b).any() for a, b in pairs)
+
+
+def test_a_team_that_goes_on_ends_like_one_that_never_stopped(tmp_path):
+    def stop(row):
+        if row["step"] == 6:
+            raise KeyboardInterrupt
+
+    params = quick(steps=7, workers=2, meet_every=2, checkpoint_s=0.0)
+    whole = train(params, tmp_path / "whole", network=tiny())
+    assert whole.step == 7  # the last round is cut short
+    assert whole.others is not None
+    with pytest.raises(KeyboardInterrupt):
+        train(params, tmp_path / "stopped", network=tiny(), report=stop, report_s=0)
+    kept = fresh(params, tiny())
+    load_checkpoint(tmp_path / "stopped" / CHECKPOINT, kept)
+    assert kept.step == 4  # of the last meeting
+    resumed = train(params, tmp_path / "stopped", network=tiny(), resume=True)
+    for a, b in zip(resumed.averaged.state_dict().values(), whole.averaged.state_dict().values(), strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=0)
+    torch.testing.assert_close(resumed.others, whole.others, rtol=0, atol=0)
 
 
 def test_expected_overlap_is_learned_from_evenly_spread_points():

@@ -34,7 +34,8 @@ def benchmark_job(out: Path) -> None:
 def train_job(out: Path) -> None:
     from covis.agents.perception.frames import Variant, joint_classes
     from covis.agents.perception.network import NetworkParams
-    from covis.agents.perception.training import TrainingParams, train
+    from covis.agents.perception.training import train
+    from covis.agents.perception.training_step import TrainingParams
     from covis.evaluation.perception_training import finish
 
     network = NetworkParams(

@@ -70,7 +70,8 @@ def trained(out):
     """The weights as they ship, and everything that a further training would go on from."""
     import torch
 
-    from covis.agents.perception.training import CHECKPOINT, LOG
+    from covis.agents.perception.training import LOG
+    from covis.agents.perception.training_step import CHECKPOINT
 
     state = torch.load(out / CHECKPOINT, weights_only=True)
     del state["seconds"]
