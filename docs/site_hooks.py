@@ -1,14 +1,18 @@
-"""MkDocs hooks: links from the book into the code become the file's path; nothing is loaded from elsewhere."""
+"""MkDocs hooks: links from the book into the code become the file's path; formulas become MathML, which browsers
+draw without a script; nothing is loaded from elsewhere."""
 
+import html
 import re
 from pathlib import Path
 from typing import Any
 
+from latex2mathml.converter import convert
 from mkdocs.exceptions import PluginError
 
 ROOT = Path(__file__).resolve().parents[1]
 LINK = re.compile(r"(?<!!)\[([^\]]+)\]\((?!https?://|#)([^)#\s]+)\)")
 
+FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
 FOREIGN = re.compile(r"<(?:script|img|iframe|source|link)\b[^>]*?\s(?:src|href)=[\"']?(?:https?:)?//[^\s>]+")
 
 
@@ -24,8 +28,19 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     return LINK.sub(shown, markdown)
 
 
+def on_page_content(content: str, **_: Any) -> str:
+    def drawn(formula: re.Match[str]) -> str:
+        tag, bracket, tex = formula.groups()
+        mathml = convert(html.unescape(tex).strip(), display="block" if bracket == "[" else "inline")
+        return f'<{tag} class="formula">{mathml}</{tag}>'
+
+    return FORMULA.sub(drawn, content)
+
+
 def on_post_page(output: str, page: Any, **_: Any) -> str:
     foreign = FOREIGN.search(output)
     if foreign:
         raise PluginError(f"{page.file.src_path} would load from elsewhere: {foreign[0]}")
+    if 'class="arithmatex"' in output:
+        raise PluginError(f"{page.file.src_path} has a formula that was not drawn")
     return output
