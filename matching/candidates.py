@@ -84,7 +84,7 @@ def assignment(support: Array, scores: Array | None = None) -> Matching:
     return Matching(np.stack([rows, cols], axis=1), np.clip(scores[rows, cols], 0.0, 1.0))
 
 
-def mean_agreement(K: Array, support: Array, limit: int = 0) -> Matching:
+def mean_agreement(K: Array, support: Array) -> Matching:
     """`assignment`, each match scored by its mean affinity K (n n', n n') with the other matches."""
     matching = assignment(support)
     if len(matching) < 2:

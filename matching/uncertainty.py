@@ -36,11 +36,6 @@ def certainty(uncertainty: Array, width: float) -> Array:
     return np.exp(-uncertainty / width)
 
 
-def distance_weights(U: Array, width_m2: float) -> Array:
-    """W^d (n, n', n, n') in full, for tests and small problems. Eq. (10)."""
-    return certainty(kronecker_plus(U.ravel(), U.ravel()), width_m2).reshape(*U.shape, *U.shape)
-
-
 def typical(variance: Array) -> float:
     """Median of the positive finite entries of `variance`, 0 if there are none."""
     known = variance[np.isfinite(variance) & (variance > 0)]

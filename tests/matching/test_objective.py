@@ -7,7 +7,8 @@ import pytest
 
 from covis.matching import ObjectGraph
 from covis.matching import objective as ob
-from covis.matching.rgm import Similarity, build
+from covis.matching import objective_state as st
+from covis.matching.rgm_problem import Similarity, build
 from covis.matching.similarity import (
     attribute_similarity,
     distances,
@@ -17,7 +18,7 @@ from covis.matching.similarity import (
     triangle_sides,
     vertex_cosines,
 )
-from covis.matching.uncertainty import attribute_statistics, certainty, distance_weights, kronecker_plus
+from covis.matching.uncertainty import attribute_statistics, certainty, kronecker_plus
 
 
 def graph(rng, n, **optional):
@@ -116,10 +117,6 @@ def test_uncertainty_weights():
     V = kronecker_plus(v, w)
     np.testing.assert_allclose(V, [[0.1, 0.6, 1.1], [0.2, 0.7, 1.2]])
     np.testing.assert_allclose(certainty(V, 0.5), np.exp(-V / 0.5))
-    # Eq. (10) is a product of one factor for each match.
-    np.testing.assert_allclose(
-        distance_weights(V, 0.5), certainty(V, 0.5)[:, :, None, None] * certainty(V, 0.5)[None, None]
-    )
     with pytest.raises(ValueError, match="width must be positive, got 0"):
         certainty(V, 0)
 
@@ -175,7 +172,7 @@ def test_mean_scaling_is_m_squared_times_mean_similarity_less_penalties():
 def test_incremental_objective_equals_full(scaling, options):
     rng = np.random.default_rng(7)
     p = problem(rng, 6, 5, scaling, **options)
-    state = ob.empty_state(6, 5)
+    state = st.empty_state(6, 5)
 
     def full(match):
         return ob.objective(p.terms, match, p.table)
@@ -190,7 +187,7 @@ def test_incremental_objective_equals_full(scaling, options):
             changed[i] = -1
         elif holder < 0:
             changed[i] = ii
-            assert ob.value_after(p.terms, state, p.table, i, ii) == pytest.approx(full(changed), abs=1e-9)
+            assert st.value_after(p.terms, state, p.table, i, ii) == pytest.approx(full(changed), abs=1e-9)
         else:
             changed[i], changed[holder] = ii, match[i]
         ob_change(p.terms, state, match, changed)
@@ -213,34 +210,34 @@ def check_best_changes(p, state, full):
             changed = state.match.copy()
             changed[i] = ii
             reassignments.append(full(changed))
-    assert ob.best_exchange(p.terms, state, p.table, now)[0] == pytest.approx(max(exchanges), abs=1e-9)
-    assert ob.best_reassignment(p.terms, state, p.table, now)[0] == pytest.approx(max(reassignments), abs=1e-9)
+    assert st.best_exchange(p.terms, state, p.table, now)[0] == pytest.approx(max(exchanges), abs=1e-9)
+    assert st.best_reassignment(p.terms, state, p.table, now)[0] == pytest.approx(max(reassignments), abs=1e-9)
 
 
 def ob_change(terms, state, before, after):
     for i in np.flatnonzero((before != after) & (before >= 0)):
-        ob.remove(terms, state, i)
+        st.remove(terms, state, i)
     for i in np.flatnonzero((before != after) & (after >= 0)):
-        ob.add(terms, state, i, after[i])
+        st.add(terms, state, i, after[i])
 
 
 def test_lists_of_triples_start_anew_when_full():
     p = problem(np.random.default_rng(9), 6, 6, neighbours=1000)
-    state = ob.empty_state(6, 6)
-    state.list_used[0] = ob.LIST_CAPACITY + 1
+    state = st.empty_state(6, 6)
+    state.list_used[0] = st.LIST_CAPACITY + 1
     for i in range(6):
-        ob.add(p.terms, state, i, 5 - i)
-        state.list_used[0] = max(state.list_used[0], ob.LIST_CAPACITY - 20 * i)
+        st.add(p.terms, state, i, 5 - i)
+        state.list_used[0] = max(state.list_used[0], st.LIST_CAPACITY - 20 * i)
     np.testing.assert_allclose(state.sums, ob.full_sums(p.terms, state.match), atol=1e-9)
 
 
 def test_removing_everything_leaves_nothing_behind():
     p = problem(np.random.default_rng(8), 6, 6)
-    state = ob.empty_state(6, 6)
+    state = st.empty_state(6, 6)
     for i in range(6):
-        ob.add(p.terms, state, i, (i + 2) % 6)
+        st.add(p.terms, state, i, (i + 2) % 6)
     for i in (3, 1, 5, 0, 2, 4):
-        ob.remove(p.terms, state, i)
+        st.remove(p.terms, state, i)
     for array in (state.sums, state.pair_gain, state.triple_gain):
         np.testing.assert_allclose(array, 0.0, atol=1e-12)
 

@@ -2,7 +2,6 @@
 
 import os
 from concurrent.futures.process import BrokenProcessPool
-from importlib import import_module
 from itertools import permutations
 
 import numpy as np
@@ -10,9 +9,11 @@ import pytest
 
 from covis.matching import ObjectGraph
 from covis.matching import objective as ob
-from covis.matching.rgm import Annealing, Similarity, rgm
-
-solver = import_module("covis.matching.rgm")  # `covis.matching.rgm` is the function
+from covis.matching import objective_state as st
+from covis.matching import rgm_chain as solver
+from covis.matching.rgm import rgm, rgm_no_covisibility, rgm_no_uncertainty
+from covis.matching.rgm_chain import Annealing
+from covis.matching.rgm_problem import Similarity, build
 
 
 def make_problem(rng, n=4, m=4, common=3, lambda_1=0.1, lambda_2=0.4):
@@ -25,7 +26,7 @@ def make_problem(rng, n=4, m=4, common=3, lambda_1=0.1, lambda_2=0.4):
     target = ObjectGraph.from_positions(q, attributes=b, position_variance=rng.uniform(0.02, 0.1, m))
     k = min(n, m)
     tables = (ob.coefficients(k, lambda_1, lambda_2, "mean", "squared"), ob.coefficients(k, 0, 0, "mean", "squared"))
-    return solver.build(source, target, Similarity(), *tables)
+    return build(source, target, Similarity(), *tables)
 
 
 def matchings(n, m):
@@ -45,7 +46,7 @@ def test_pi_is_the_best_assignment_of_the_active_objects():
         order = np.argsort(-p.support.ravel(), kind="stable")
         for mask in range(1, 16):
             active = np.array([bool(mask >> i & 1) for i in range(4)])
-            state = ob.empty_state(4, 4)
+            state = st.empty_state(4, 4)
             solver.assign(p.terms, p.table_pi, state, active, order)
             assert ((state.match >= 0) == active).all()
             value = ob.objective(p.terms, state.match, p.table_pi)
@@ -77,7 +78,7 @@ def test_metropolis_chain_has_the_stationary_distribution_of_eq_16():
     for mask in range(16):
         active = np.array([bool(mask >> i & 1) for i in range(4)])
         if active.sum() <= 3:
-            state = ob.empty_state(4, 3)
+            state = st.empty_state(4, 3)
             solver.assign(p.terms, p.table_pi, state, active, order)
             log_p[mask] = ob.value(state.sums, state.size[0], p.table) / temperature
     expected = np.exp(log_p - log_p.max())
@@ -112,11 +113,63 @@ def test_paper_acceptance_only_climbs():
     )  # fmt: skip
     values = []
     for mask in visited:
-        state = ob.empty_state(5, 5)
+        state = st.empty_state(5, 5)
         solver.assign(p.terms, p.table_pi, state, np.array([bool(mask >> i & 1) for i in range(5)]), order)
         values.append(ob.value(state.sums, state.size[0], p.table))
     assert (np.diff(values) >= -1e-12).all()
     assert best == pytest.approx(max(values))
+
+
+def literal_algorithm_1(p, order, active, temperatures, metropolis, alpha, draws):
+    """Visited sets, line by line; every pi(y) is found afresh."""
+    n, m = p.terms.attribute.shape
+
+    def log_p(y):
+        if y.sum() > m:
+            return -np.inf
+        state = st.empty_state(n, m)
+        solver.assign(p.terms, p.table_pi, state, y, order)
+        return ob.objective(p.terms, state.match, p.table)  # Eq. (16)
+
+    y, visited = active.copy(), []
+    for T, draw in zip(temperatures, draws, strict=True):
+        i, log_q = solver.propose(y, p.proposal_weight, alpha, draw)  # Eq. (18)
+        if i >= 0:
+            proposed = y.copy()
+            proposed[i] = not proposed[i]
+            rise = log_p(proposed) - log_p(y)
+            ratio = min(np.exp((rise / T if metropolis else rise) + log_q), 1.0)  # Eq. (19)
+            if ratio > draw[2] and (metropolis or rise > 0):
+                y = proposed
+        visited.append(sum(1 << k for k in np.flatnonzero(y)))
+    return visited
+
+
+@pytest.mark.parametrize("metropolis", [False, True])
+def test_chain_is_algorithm_1_step_by_step(metropolis):
+    moves = 0
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        p = make_problem(rng, n=5, m=4, common=3, lambda_2=0.6)
+        order = np.argsort(-p.support.ravel(), kind="stable")
+        active = rng.random(5) < 0.5
+        temperatures = Annealing(proposals=60).temperatures(5)
+        draws = rng.random((60, 3))
+        draws[:, 2] **= 0.25  # high thresholds, so that the ratio decides
+        _, _, visited = solver.run_chain(
+            p.terms, p.table, p.table_pi, order, p.proposal_weight, active, temperatures, metropolis, 0.4, draws
+        )
+        expected = literal_algorithm_1(p, order, active, temperatures, metropolis, 0.4, draws)
+        assert visited.tolist() == expected
+        moves += len(set(expected)) - 1
+    assert moves > 10
+
+
+def test_temperature_falls_geometrically_from_start_to_end():
+    T = Annealing(proposals=50, start_temperature=5.0, end_temperature=0.2).temperatures(15)
+    assert (len(T), T[0], T[-1]) == (50, pytest.approx(5.0), pytest.approx(0.2))
+    np.testing.assert_allclose(T[1:] / T[:-1], T[1] / T[0])  # T = xi T
+    assert len(Annealing().temperatures(15)) == 200  # the paper's number at n = 15
 
 
 def scene(rng, common=8, extra=4, noise=0.05):
@@ -156,6 +209,78 @@ def test_workers_share_the_proposals():
     two = rgm(source, target, proposals=200, workers=2)
     assert two.diagnostics["log_p"] >= 0.8 * one.diagnostics["log_p"] > 0
     assert sum(truth.get(int(a)) == b for a, b in two.pairs) > len(two) / 2
+
+
+def test_every_worker_runs_an_equal_share_and_the_best_result_counts(monkeypatch):
+    class Here:
+        jobs = ()
+
+        def map(self, function, problems, jobs, streams):
+            self.jobs = tuple(jobs)
+            self.first_draws = [rng.random() for rng in streams]
+            return [(np.array([k]), [1.0, 7.0, 3.0][k]) for k in range(len(self.jobs))]
+
+    here = Here()
+    monkeypatch.setattr(solver, "_pool", lambda workers: here)
+    p = make_problem(np.random.default_rng(0))
+    annealing = Annealing(proposals=100, acceptance="metropolis", add_probability=0.3)
+    match, log_p = solver.solve(p, annealing, np.random.default_rng(0), workers=3)
+    assert (match.tolist(), log_p) == ([1], 7.0)
+    assert here.jobs == (Annealing(proposals=34, acceptance="metropolis", add_probability=0.3),) * 3
+    assert len(set(here.first_draws)) == 3
+
+
+@pytest.mark.parametrize(
+    ("ablation", "weight"),
+    [(rgm_no_uncertainty, "uncertainty_weight"), (rgm_no_covisibility, "noncovisibility_weight")],
+)
+def test_an_ablation_is_a_weight_of_zero_and_nothing_else(ablation, weight):
+    p = scene(np.random.default_rng(6), common=5, extra=6, noise=0.8)
+    found, expected = ablation(*p[:2]), rgm(*p[:2], **{weight: 0.0})
+    assert found.pairs.tolist() == expected.pairs.tolist()
+    assert found.diagnostics["log_p"] == expected.diagnostics["log_p"] != rgm(*p[:2]).diagnostics["log_p"]
+
+
+def test_published_weights_are_the_defaults():
+    p = scene(np.random.default_rng(7), noise=0.5)
+    given = rgm(*p[:2], uncertainty_weight=0.1, noncovisibility_weight=0.4, add_probability=0.5)
+    assert given.diagnostics["log_p"] == rgm(*p[:2]).diagnostics["log_p"]
+
+
+def test_objective_does_not_depend_on_the_order_of_objects_nor_of_robots():
+    source, target, _ = scene(np.random.default_rng(8), common=5, extra=2, noise=0.5)
+    tables = (ob.coefficients(7, 0.1, 0.4, "mean", "squared"), ob.coefficients(7, 0, 0, "mean", "squared"))
+    every_triangle = Similarity(neighbours=7**3)  # nearest triangles are looked for from the source's side
+    rng = np.random.default_rng(0)
+    a, b = rng.permutation(7), rng.permutation(7)
+    straight = build(source, target, every_triangle, *tables)
+    shuffled = build(source.take(a), target.take(b), every_triangle, *tables)
+    swapped = build(target, source, every_triangle, *tables)
+    for _ in range(20):
+        match = np.where(rng.random(7) < 0.3, -1, rng.permutation(7))
+        expected = ob.objective(straight.terms, match, straight.table)
+        # Source object a[k] stands at k, target object b[l] at l.
+        moved = np.array([-1 if match[i] < 0 else int(np.flatnonzero(b == match[i])[0]) for i in a])
+        assert ob.objective(shuffled.terms, moved, shuffled.table) == pytest.approx(expected)
+        back = np.full(7, -1)
+        back[match[match >= 0]] = np.flatnonzero(match >= 0)
+        assert ob.objective(swapped.terms, back, swapped.table) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("acceptance", ["paper", "metropolis"])
+def test_matches_hardly_depend_on_the_order_of_objects_nor_of_robots(acceptance):
+    same = total = 0
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        source, target, _ = scene(rng)
+        a, b = rng.permutation(len(source)), rng.permutation(len(target))
+        straight = {(int(i), int(j)) for i, j in rgm(source, target, acceptance=acceptance).pairs}
+        shuffled = rgm(source.take(a), target.take(b), acceptance=acceptance).pairs
+        swapped = rgm(target, source, acceptance=acceptance).pairs
+        for other in ({(int(a[i]), int(b[j])) for i, j in shuffled}, {(int(j), int(i)) for i, j in swapped}):
+            same += len(straight & other)
+            total += max(len(straight), len(other))
+    assert same / total > 0.9
 
 
 def test_a_lost_process_costs_one_call():
