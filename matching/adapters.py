@@ -72,7 +72,7 @@ def pygm(
     Returns:
         min(n, n') matches, each scored by its mean affinity with the others.
     """
-    check_comparable(source, target)
+    check_comparable(source, target, prior)
     check_size(f"pygm:{solver}", source, target, MAX_CANDIDATES)
     n, m = len(source), len(target)
     if n == 0 or m == 0:
@@ -120,7 +120,7 @@ def kiss_matcher(
     Returns:
         Matches it keeps as inliers of one rigid motion, each object once; score 1.
     """
-    check_comparable(source, target)
+    check_comparable(source, target, prior)
     check_size("kiss-matcher", source, target, MAX_CANDIDATES)
     if min(len(source), len(target)) < 3:
         return Matching.empty()

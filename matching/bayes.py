@@ -88,7 +88,7 @@ def bayes(
         ValueError: graphs of different classes, or an option out of its range.
     """
     _check_options(min_score, common_probability, screened, refined)
-    check_comparable(source, target)
+    check_comparable(source, target, prior)
     n, m = len(source), len(target)
     if n == 0 or m == 0:
         return Matching.empty()

@@ -47,7 +47,7 @@ def bcagm(
     Raises:
         ValueError: a parameter out of range, too many objects, different attribute classes.
     """
-    check_comparable(source, target)
+    check_comparable(source, target, prior)
     check_size("bcagm", source, target, MAX_CANDIDATES)
     if iterations < 1:
         raise ValueError(f"iterations must be at least 1, got {iterations}")

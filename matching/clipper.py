@@ -53,7 +53,7 @@ def clipper(
     Raises:
         ValueError: a parameter out of range, too many candidates, different attribute classes.
     """
-    check_comparable(source, target)
+    check_comparable(source, target, prior)
     check_size("clipper", source, target, MAX_CANDIDATES)
     if not 0 <= min_similarity <= 1:
         raise ValueError(f"min_similarity must lie in [0, 1], got {min_similarity}")

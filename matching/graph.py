@@ -26,14 +26,15 @@ class ObjectGraph:
         attribute_variance: (n,) mean variance of the attribute's elements, the paper's v; inf = unknown.
         covariances: optional (n, 3, 3) m^2, full position covariance in the sensor frame.
         up: optional (3,) unit vector against gravity, sensor frame (from the IMU).
-        forward: optional (3,) unit vector of the optical axis, sensor frame; needed with `horizontal_fov_rad`.
+        forward: optional (3,) unit vector of the optical axis, sensor frame.
         embedding: optional (n, e) appearance vectors.
         intrinsics: optional (3, 3) pinhole matrix; the sensor frame is then a camera's (x right, y down, z forward).
         image_size: optional (width, height) in pixels.
-        horizontal_fov_rad: optional full horizontal field of view, radians.
+        horizontal_fov_rad: optional full horizontal field of view, radians; of use only with `forward` and `up`.
 
     Raises:
-        ValueError: a wrong shape, a value that is not finite, a negative variance.
+        ValueError: a wrong shape, something that is no number, a value that is not finite, a negative variance, or a
+            matrix that is no covariance.
     """
 
     positions: Array
@@ -65,12 +66,7 @@ class ObjectGraph:
             put(self, name, _variance(getattr(self, name), name, n))
         if self.covariances is not None:
             covariances = _finite(self.covariances, "covariances")
-            if covariances.shape != (n, 3, 3):
-                raise ValueError(f"covariances must have shape ({n}, 3, 3), got {covariances.shape}")
-            if not np.allclose(covariances, covariances.transpose(0, 2, 1), rtol=1e-5, atol=1e-9):
-                raise ValueError("covariances must be symmetric")
-            if n and np.linalg.eigvalsh(covariances).min() < -1e-6 * max(1e-9, float(np.abs(covariances).max())):
-                raise ValueError("covariances must be positive semidefinite")
+            _check_covariances(covariances, n)
             put(self, "covariances", covariances)
         for name in ("up", "forward"):
             if getattr(self, name) is not None:
@@ -86,12 +82,12 @@ class ObjectGraph:
                 raise ValueError(f"intrinsics must be (3, 3) with positive focal lengths, got\n{K}")
             put(self, "intrinsics", K)
         if self.image_size is not None:
-            width, height = (int(x) for x in self.image_size)
-            if width < 1 or height < 1:
-                raise ValueError(f"image_size must be (width, height) >= 1, got {self.image_size}")
-            put(self, "image_size", (width, height))
-        if self.horizontal_fov_rad is not None and not 0 < self.horizontal_fov_rad <= 2 * np.pi:
-            raise ValueError(f"horizontal_fov_rad must lie in (0, 2 pi], got {self.horizontal_fov_rad}")
+            put(self, "image_size", _pixels(self.image_size))
+        if self.horizontal_fov_rad is not None:
+            fov = float(_finite(self.horizontal_fov_rad, "horizontal_fov_rad"))
+            if not 0 < fov <= 2 * np.pi:
+                raise ValueError(f"horizontal_fov_rad must lie in (0, 2 pi], got {fov}")
+            put(self, "horizontal_fov_rad", fov)
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -109,13 +105,20 @@ class ObjectGraph:
         """The quickest graph: positions (n, 3) m, one class, the same standard deviation (0.1 m) for all.
 
         A scalar `position_variance` (m^2) or `attribute_variance` holds for every object; `optional` takes the other
-        fields of `ObjectGraph`.
+        fields of `ObjectGraph`. An empty list stands for no object.
+
+        Raises:
+            ValueError: as `ObjectGraph`.
         """
-        p = np.asarray(positions, dtype=np.float64).reshape(-1, 3) if np.size(positions) == 0 else np.asarray(positions)
+        p = _numbers(positions, "positions")
+        if p.shape == (0,):
+            p = p.reshape(0, 3)
+        if p.ndim != 2:
+            raise ValueError(f"positions must have shape (n, 3), got {p.shape}")
         n = len(p)
-        a = np.ones((n, 1)) if attributes is None else np.asarray(attributes, dtype=np.float64)
-        u = np.broadcast_to(np.asarray(position_variance, dtype=np.float64), (n,)).copy()
-        v = np.broadcast_to(np.asarray(attribute_variance, dtype=np.float64), (n,)).copy()
+        a = np.ones((n, 1)) if attributes is None else _numbers(attributes, "attributes")
+        u = _for_each(position_variance, "position_variance", n)
+        v = _for_each(attribute_variance, "attribute_variance", n)
         return cls(p, a, u, v, **optional)
 
     def take(self, index: NDArray[np.int64]) -> ObjectGraph:
@@ -235,28 +238,86 @@ class PriorRequiredError(ValueError):
 
 
 def generator(rng: np.random.Generator | None) -> np.random.Generator:
-    """The matcher's random stream: `rng`, or the fixed default stream."""
-    return np.random.default_rng(0) if rng is None else rng
+    """The matcher's random stream: `rng`, or the fixed default stream. Raises TypeError unless it is a Generator."""
+    if rng is None:
+        return np.random.default_rng(0)
+    if not isinstance(rng, np.random.Generator):
+        raise TypeError(f"rng must be a numpy Generator such as numpy.random.default_rng(3), got {rng!r}")
+    return rng
 
 
-def check_comparable(source: ObjectGraph, target: ObjectGraph) -> None:
-    """Raises ValueError unless both graphs speak of the same classes."""
+def check_comparable(source: ObjectGraph, target: ObjectGraph, prior: RelativePose | None = None) -> None:
+    """What every matcher asks of its arguments.
+
+    Raises:
+        TypeError: something else than two graphs and a relative pose or None.
+        ValueError: the graphs speak of different numbers of classes.
+    """
+    for name, graph in (("source", source), ("target", target)):
+        if not isinstance(graph, ObjectGraph):
+            raise TypeError(
+                f"{name} must be an ObjectGraph, got {type(graph).__name__}; ObjectGraph.from_positions makes one"
+            )
+    if prior is not None and not isinstance(prior, RelativePose):
+        raise TypeError(f"prior must be a RelativePose or None, got {type(prior).__name__}")
     if source.attributes.shape[1] != target.attributes.shape[1]:
         raise ValueError(
             f"source has {source.attributes.shape[1]} attribute classes, target has {target.attributes.shape[1]}"
         )
 
 
+def _numbers(values: ArrayLike, name: str) -> Array:
+    """As float64 array. Raises ValueError naming `name` unless `values` is a regular array of real numbers."""
+    try:
+        array = np.asarray(values)
+    except ValueError as error:  # rows of different lengths
+        raise ValueError(f"{name} must be a regular array of numbers: {error}") from error
+    if array.dtype.kind not in "buif":
+        raise ValueError(f"{name} must be real numbers, got {array.dtype} {values!r:.80}")
+    return array.astype(np.float64, copy=False)
+
+
 def _finite(values: ArrayLike, name: str) -> Array:
-    array = np.asarray(values, dtype=np.float64)
+    array = _numbers(values, name)
     if not np.isfinite(array).all():
         where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise ValueError(f"{name} must be finite, got {array[where]} at {where}")
     return array
 
 
+def _for_each(values: ArrayLike, name: str, n: int) -> Array:
+    """(n,) `values`, or one value for every object."""
+    array = _numbers(values, name)
+    if array.shape not in ((), (n,)):
+        raise ValueError(f"{name} must be one number or have shape ({n},), got {array.shape}")
+    return np.broadcast_to(array, (n,)).copy()
+
+
+def _check_covariances(covariances: Array, n: int) -> None:
+    if covariances.shape != (n, 3, 3):
+        raise ValueError(f"covariances must have shape ({n}, 3, 3), got {covariances.shape}")
+    if n == 0:
+        return
+    difference = np.abs(covariances - covariances.transpose(0, 2, 1))
+    skew = (difference > 1e-9 + 1e-5 * np.abs(covariances)).any(axis=(1, 2))
+    if skew.any():
+        bad = int(np.argmax(skew))
+        raise ValueError(f"covariances must be symmetric, got {covariances[bad].tolist()} at {bad}")
+    lowest = np.linalg.eigvalsh(covariances)[:, 0]
+    if lowest.min() < -1e-6 * max(1e-9, float(np.abs(covariances).max())):
+        bad = int(np.argmin(lowest))
+        raise ValueError(f"covariances must be positive semidefinite, got an eigenvalue {lowest[bad]:.3g} at {bad}")
+
+
+def _pixels(image_size: ArrayLike) -> tuple[int, int]:
+    array = _finite(image_size, "image_size")
+    if array.shape != (2,) or (array < 1).any() or (array != np.round(array)).any():
+        raise ValueError(f"image_size must be (width, height) >= 1 in whole pixels, got {image_size}")
+    return int(array[0]), int(array[1])
+
+
 def _variance(values: ArrayLike, name: str, n: int) -> Array:
-    array = np.asarray(values, dtype=np.float64)
+    array = _numbers(values, name)
     if array.shape != (n,):
         raise ValueError(f"{name} must have shape ({n},), got {array.shape}")
     if n and not (array >= 0).all():

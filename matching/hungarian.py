@@ -32,11 +32,11 @@ def hungarian(
         PriorRequiredError: no prior given.
         ValueError: gate_m is not positive.
     """
+    check_comparable(source, target, prior)
     if prior is None:
         raise PriorRequiredError("hungarian needs a relative pose: give a prior, or run with --pose known")
     if not gate_m > 0:
         raise ValueError(f"gate_m must be positive, got {gate_m}")
-    check_comparable(source, target)
     if len(source) == 0 or len(target) == 0:
         return Matching.empty()
     mapped = transform(prior.T_source_target, target.positions)

@@ -54,7 +54,7 @@ def icp(
     Raises:
         ValueError: a parameter out of range, or different attribute classes.
     """
-    check_comparable(source, target)
+    check_comparable(source, target, prior)
     if restarts < 1 or iterations < 1:
         raise ValueError(f"restarts and iterations must be at least 1, got {restarts} and {iterations}")
     if not 0 <= gate_shrink < 1:

@@ -52,7 +52,7 @@ def mos(
     Raises:
         ValueError: a parameter out of range, too many objects, different attribute classes.
     """
-    check_comparable(source, target)
+    check_comparable(source, target, prior)
     check_size("mos", source, target, MAX_CANDIDATES)
     check_walk(walk_weight, inflation, iterations, sinkhorn_iterations)
     if len(order_weights) != 3 or min(order_weights) < 0 or not sum(order_weights) > 0:

@@ -32,7 +32,7 @@ def reid(
     """
     if not 0.0 <= min_similarity <= 1.0:
         raise ValueError(f"min_similarity must lie in [0, 1], got {min_similarity}")
-    check_comparable(source, target)
+    check_comparable(source, target, prior)
     if len(source) == 0 or len(target) == 0:
         return Matching.empty()
     A = _appearance(source, target, use_embedding)

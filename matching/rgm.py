@@ -97,7 +97,7 @@ def rgm(
     Raises:
         ValueError: a parameter out of range, more than `MAX_OBJECTS` objects, or different attribute classes.
     """
-    check_comparable(source, target)
+    check_comparable(source, target, prior)
     similarity = Similarity(
         distance_width_m2,
         distance_width_factor,

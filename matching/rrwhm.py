@@ -52,7 +52,7 @@ def rrwhm(
     Raises:
         ValueError: a parameter out of range, too many objects, different attribute classes.
     """
-    check_comparable(source, target)
+    check_comparable(source, target, prior)
     check_size("rrwhm", source, target, MAX_CANDIDATES)
     check_walk(walk_weight, inflation, iterations, sinkhorn_iterations)
     if min(len(source), len(target)) < 3:

@@ -51,7 +51,7 @@ def rrwm(
     Raises:
         ValueError: a parameter out of range, too many objects, different attribute classes.
     """
-    check_comparable(source, target)
+    check_comparable(source, target, prior)
     check_size("rrwm", source, target, MAX_CANDIDATES)
     check_walk(walk_weight, inflation, iterations, sinkhorn_iterations)
     if len(source) == 0 or len(target) == 0:

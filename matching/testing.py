@@ -8,11 +8,14 @@ def test_contract():
 
 from __future__ import annotations
 
+import copy
+import inspect
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from .graph import Matcher, Matching, ObjectGraph, PriorRequiredError
@@ -68,7 +71,7 @@ def degenerate_problems() -> Iterator[MatchingProblem]:
     up = np.array([0.0, 0, 1])
 
     def graph(positions: Any, **options: Any) -> ObjectGraph:
-        return ObjectGraph.from_positions(np.asarray(positions, dtype=float).reshape(-1, 3), up=up, **options)
+        return ObjectGraph.from_positions(np.array(positions, dtype=float).reshape(-1, 3), up=up, **options)
 
     cloud = rng.uniform(-10, 10, (6, 3))
     other = rng.uniform(-10, 10, (5, 3))
@@ -99,7 +102,9 @@ def degenerate_problems() -> Iterator[MatchingProblem]:
     far = cloud * 1e6
     yield MatchingProblem("far away", graph(far), graph(far))
     nobody = np.zeros((6, 3))
-    yield MatchingProblem("attributes all zero", graph(cloud, attributes=nobody), graph(other, attributes=nobody[:5]))
+    yield MatchingProblem(
+        "attributes all zero", graph(cloud, attributes=nobody), graph(other, attributes=nobody[1:].copy())
+    )
     opposed = (np.tile([1.0, 0.0], (6, 1)), np.tile([0.0, 1.0], (5, 1)))
     yield MatchingProblem("no common class", graph(cloud, attributes=opposed[0]), graph(other, attributes=opposed[1]))
 
@@ -109,15 +114,27 @@ def _grid() -> Array:
 
 
 def check_well_formed(matching: Matching, source: ObjectGraph, target: ObjectGraph, name: str = "") -> None:
-    """AssertionError unless `matching` is one-to-one, in range, and scored in [0, 1]."""
+    """AssertionError unless `matching` is one-to-one, in range, and scored in [0, 1]; likewise its hypotheses."""
     assert isinstance(matching, Matching), f"{name}: a matcher returns a Matching, got {type(matching).__name__}"
-    pairs, scores = matching.pairs, matching.scores
-    assert pairs.shape == (len(matching), 2), f"{name}: pairs have shape {pairs.shape}"
-    assert scores.shape == (len(matching),), f"{name}: scores have shape {scores.shape}"
+    _check_pairs(matching.pairs, matching.scores, source, target, name)
+    pose = matching.pose
+    assert pose is None or isinstance(pose, RelativePose), f"{name}: pose is no RelativePose but {pose!r}"
+    for h in matching.hypotheses:
+        assert 0 <= h.probability <= 1, f"{name}: a hypothesis has probability {h.probability}"
+        _check_pairs(h.pairs, h.scores, source, target, f"{name}, a hypothesis")
+
+
+def _check_pairs(pairs: NDArray[np.int64], scores: Array, source: ObjectGraph, target: ObjectGraph, name: str) -> None:
+    k = len(pairs)
+    assert pairs.shape == (k, 2), f"{name}: pairs have shape {pairs.shape}"
+    assert scores.shape == (k,), f"{name}: scores have shape {scores.shape}"
     assert np.isfinite(scores).all(), f"{name}: a score is not finite"
-    assert len(matching) <= min(len(source), len(target)), f"{name}: more matches than objects"
-    if len(matching):
-        assert (pairs.max(axis=0) < (len(source), len(target))).all(), f"{name}: a match of no object"
+    assert ((scores >= 0) & (scores <= 1)).all(), f"{name}: a score is outside [0, 1]: {scores.tolist()}"
+    assert k <= min(len(source), len(target)), f"{name}: more matches than objects"
+    if k:
+        assert pairs.min() >= 0, f"{name}: a match of no object, {pairs.tolist()}"
+        assert (pairs.max(axis=0) < (len(source), len(target))).all(), f"{name}: a match of no object, {pairs.tolist()}"
+        assert all(len(np.unique(column)) == k for column in pairs.T), f"{name}: an object is matched twice"
 
 
 def check_matcher(
@@ -130,8 +147,9 @@ def check_matcher(
 ) -> None:
     """Raises AssertionError, saying what is wrong, unless `matcher` keeps the contract of this library.
 
-    It must answer every degenerate problem with a well-formed `Matching`, leave its inputs alone, give the same answer
-    for the same `rng`, and, on an easy scene, find the objects.
+    It must take the arguments of `Matcher`, with and without a prior and a random stream; answer every degenerate
+    problem with a well-formed `Matching`; leave its inputs and NumPy's global random stream alone; give the same answer
+    for the same `rng`; and, on an easy scene, find the objects.
 
     Args:
         matcher: the callable under test.
@@ -142,13 +160,14 @@ def check_matcher(
         options: passed to every call.
     """
     options = options or {}
+    _check_signature(matcher, options)
     for problem in degenerate_problems():
         prior = RelativePose(np.eye(4), np.eye(6)) if needs_prior else None
-        found = matcher(problem.source, problem.target, prior=prior, rng=np.random.default_rng(0), **options)
-        check_well_formed(found, problem.source, problem.target, problem.name)
+        _call(matcher, problem, prior, np.random.default_rng(0), options)
+    scenes = [scene(np.random.default_rng(seed)) for seed in range(4)]
+    _call(matcher, scenes[0], scenes[0].prior, np.random.default_rng(7), options)
     if needs_prior:
         _check_refuses_without_prior(matcher, options)
-    scenes = [scene(np.random.default_rng(seed)) for seed in range(4)]
     _check_repeatable(matcher, scenes[0], needs_prior, options)
     if invariant:
         _check_permutations(matcher, scenes[0], needs_prior, options)
@@ -157,9 +176,62 @@ def check_matcher(
         assert f1 >= min_f1, f"F1 on easy scenes is {f1:.2f}, expected at least {min_f1}"
 
 
-def _call(matcher: Matcher, problem: MatchingProblem, needs_prior: bool, options: dict[str, Any]) -> Matching:
-    prior = problem.prior if needs_prior else None
-    return matcher(problem.source, problem.target, prior=prior, rng=np.random.default_rng(7), **options)
+def _check_signature(matcher: Matcher, options: dict[str, Any]) -> None:
+    assert callable(matcher), f"a matcher is callable, got {matcher!r}"
+    try:
+        signature = inspect.signature(matcher)
+    except ValueError:  # some builtins have none
+        return
+    for given in ({}, {"prior": None}, {"prior": None, "rng": None}):
+        try:
+            signature.bind(None, None, **given, **options)
+        except TypeError as error:
+            wanted = "(source, target, *, prior=None, rng=None, **options)"
+            raise AssertionError(f"a matcher takes {wanted}, not {signature}: {error}") from None
+
+
+def _call(
+    matcher: Matcher,
+    problem: MatchingProblem,
+    prior: RelativePose | None,
+    rng: np.random.Generator | None,
+    options: dict[str, Any],
+) -> Matching:
+    """The matcher's answer, well-formed and without side effects."""
+    source, target, name = problem.source, problem.target, problem.name
+    before = copy.deepcopy((source, target, prior))
+    global_stream = _global_stream()
+    try:
+        found = matcher(source, target, prior=prior, rng=rng, **options)
+    except PriorRequiredError as error:
+        raise AssertionError(f"{name}: a matcher that needs poses is checked with needs_prior=True") from error
+    except Exception as error:
+        raise AssertionError(f"{name}: the matcher raised {type(error).__name__}: {error}") from error
+    check_well_formed(found, source, target, name)
+    for side, was, now in zip(("source", "target", "prior"), before, (source, target, prior), strict=True):
+        changed = _changed_field(was, now)
+        assert changed is None, f"{name}: the matcher changed its input, {side}.{changed}"
+    assert global_stream == _global_stream(), f"{name}: the matcher uses NumPy's global random stream, not rng"
+    return found
+
+
+def _global_stream() -> str:
+    return repr(np.random.get_state())  # noqa: NPY002
+
+
+def _changed_field(before: Any, after: Any) -> str | None:
+    """The name of the first array that differs between two dataclasses, or None."""
+    if before is None:
+        return None
+    for field in fields(before):
+        one, other = getattr(before, field.name), getattr(after, field.name)
+        if isinstance(one, np.ndarray) and not np.array_equal(one, other, equal_nan=True):
+            return field.name
+    return None
+
+
+def _solve(matcher: Matcher, problem: MatchingProblem, needs_prior: bool, options: dict[str, Any]) -> Matching:
+    return _call(matcher, problem, problem.prior if needs_prior else None, np.random.default_rng(7), options)
 
 
 def _check_refuses_without_prior(matcher: Matcher, options: dict[str, Any]) -> None:
@@ -172,21 +244,24 @@ def _check_refuses_without_prior(matcher: Matcher, options: dict[str, Any]) -> N
 
 
 def _check_repeatable(matcher: Matcher, problem: MatchingProblem, needs_prior: bool, options: dict[str, Any]) -> None:
-    before = problem.source.positions.copy(), problem.target.positions.copy()
-    first = _call(matcher, problem, needs_prior, options)
-    second = _call(matcher, problem, needs_prior, options)
-    assert (first.pairs == second.pairs).all(), "the same rng gives different matches"
-    assert (first.scores == second.scores).all(), "the same rng gives different scores"
-    unchanged = (problem.source.positions == before[0]).all() and (problem.target.positions == before[1]).all()
-    assert unchanged, "the matcher changed its input"
+    prior = problem.prior if needs_prior else None
+    for seed in (7, None):
+        first, second = (
+            _call(matcher, problem, prior, None if seed is None else np.random.default_rng(seed), options)
+            for _ in range(2)
+        )
+        stream = "no rng" if seed is None else "the same rng"
+        same = np.array_equal(first.pairs, second.pairs)
+        assert same, f"{stream} gives different matches from call to call"
+        assert (first.scores == second.scores).all(), f"{stream} gives different scores from call to call"
 
 
 def _check_permutations(matcher: Matcher, problem: MatchingProblem, needs_prior: bool, options: dict[str, Any]) -> None:
     rng = np.random.default_rng(3)
     p, q = rng.permutation(len(problem.source)), rng.permutation(len(problem.target))
     shuffled = MatchingProblem("shuffled", problem.source.take(p), problem.target.take(q), None, problem.prior)
-    straight = {(int(a), int(b)) for a, b in _call(matcher, problem, needs_prior, options).pairs}
-    found = {(int(p[a]), int(q[b])) for a, b in _call(matcher, shuffled, needs_prior, options).pairs}
+    straight = {(int(a), int(b)) for a, b in _solve(matcher, problem, needs_prior, options).pairs}
+    found = {(int(p[a]), int(q[b])) for a, b in _solve(matcher, shuffled, needs_prior, options).pairs}
     assert straight == found, f"another order of objects gives other matches: {sorted(straight ^ found)}"
 
 
@@ -194,7 +269,7 @@ def _pooled_f1(matcher: Matcher, problems: list[MatchingProblem], needs_prior: b
     correct = total = 0
     for problem in problems:
         assert problem.truth is not None
-        found = _call(matcher, problem, needs_prior, options)
+        found = _solve(matcher, problem, needs_prior, options)
         correct += int((problem.truth[found.pairs[:, 0]] == found.pairs[:, 1]).sum())
         total += len(found) + int((problem.truth >= 0).sum())
     return 2 * correct / total

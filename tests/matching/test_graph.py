@@ -32,18 +32,66 @@ def test_empty_graph_is_valid():
         ("attributes", -np.ones((3, 2)), "attributes must be non-negative, got -1"),
         ("position_variance", np.array([1.0, -2.0, 1.0]), "position_variance must be non-negative, got -2.0 at 1"),
         ("attribute_variance", np.array([1.0, 1.0, np.nan]), "attribute_variance must be non-negative, got nan at 2"),
-        ("covariances", np.tile([[1.0, 2, 0], [0, 1, 0], [0, 0, 1]], (3, 1, 1)), "covariances must be symmetric"),
-        ("covariances", np.tile(-np.eye(3), (3, 1, 1)), "covariances must be positive semidefinite"),
+        ("positions", [[0.0, 1], [2]], "positions must be a regular array of numbers"),
+        ("positions", [["a", "b", "c"]] * 3, "positions must be real numbers, got <U1"),
+        ("positions", None, "positions must be real numbers, got object None"),
+        ("positions", np.ones((3, 3)) * 1j, "positions must be real numbers, got complex128"),
+        ("attributes", ["car", "bus", "car"], r"attributes must be real numbers, got <U3 \['car', 'bus', 'car'\]"),
+        ("attributes", [0, 1, 0], r"attributes must have shape \(3, c\) with c >= 1, got \(3,\)"),
+        (
+            "covariances",
+            [np.eye(3), [[1.0, 2, 0], [0, 1, 0], [0, 0, 1]], np.eye(3)],
+            r"covariances must be symmetric, got \[\[1.0, 2.0, 0.0\].* at 1",
+        ),
+        ("covariances", [np.eye(3)] * 2 + [np.diag([1, 1, -2])], "positive semidefinite, got an eigenvalue -2 at 2"),
+        ("covariances", np.eye(3), r"covariances must have shape \(3, 3, 3\), got \(3, 3\)"),
         ("up", np.array([0.0, 0.0, 2.0]), "up must be a unit vector, its length is 2"),
         ("embedding", np.ones((2, 4)), r"embedding must have shape \(3, e\)"),
         ("intrinsics", np.zeros((3, 3)), "positive focal lengths"),
         ("image_size", (0, 10), r"image_size must be \(width, height\) >= 1"),
+        ("image_size", (640,), r"image_size must be \(width, height\) >= 1 in whole pixels, got \(640,\)"),
+        ("image_size", (640.5, 480), "in whole pixels"),
+        ("horizontal_fov_rad", "wide", "horizontal_fov_rad must be real numbers"),
         ("horizontal_fov_rad", 7.0, r"horizontal_fov_rad must lie in \(0, 2 pi\], got 7.0"),
     ],
 )
 def test_bad_fields_are_named(field, value, message):
     with pytest.raises(ValueError, match=message):
         graph(**{field: value})
+
+
+@pytest.mark.parametrize(
+    ("positions", "options", "message"),
+    [
+        ([1.0, 2.0, 3.0], {}, r"positions must have shape \(n, 3\), got \(3,\)"),
+        (np.zeros((0, 2)), {}, r"positions must have shape \(n, 3\), got \(0, 2\)"),
+        (np.zeros((4, 2)), {}, r"positions must have shape \(n, 3\), got \(4, 2\)"),
+        (5.0, {}, r"positions must have shape \(n, 3\), got \(\)"),
+        (
+            np.eye(3),
+            {"position_variance": [1, 2]},
+            r"position_variance must be one number or have shape \(3,\), got \(2,\)",
+        ),
+        (
+            np.eye(3),
+            {"position_variance": np.ones((3, 3))},
+            r"position_variance must be one number or have shape \(3,\)",
+        ),
+        (np.eye(3), {"position_variance": -1}, "position_variance must be non-negative, got -1.0 at 0"),
+        (np.eye(3), {"attribute_variance": "low"}, "attribute_variance must be real numbers"),
+    ],
+)
+def test_bad_positions_and_variances_are_named(positions, options, message):
+    with pytest.raises(ValueError, match=message):
+        ObjectGraph.from_positions(positions, **options)
+
+
+@pytest.mark.parametrize("kind", [list, np.float32, np.int64])
+def test_any_kind_of_numbers_becomes_float64(kind):
+    given = [[1, 2, 3], [4, 5, 6]] if kind is list else np.array([[1, 2, 3], [4, 5, 6]], dtype=kind)
+    g = ObjectGraph.from_positions(given, position_variance=[1, 2])
+    assert g.positions.dtype == g.position_variance.dtype == np.float64
+    assert g.positions.tolist() == [[1, 2, 3], [4, 5, 6]]
 
 
 def test_infinite_variance_means_unknown():
