@@ -312,7 +312,7 @@ def _check_covariances(covariances: Array, n: int) -> None:
 def _pixels(image_size: ArrayLike) -> tuple[int, int]:
     array = _finite(image_size, "image_size")
     if array.shape != (2,) or (array < 1).any() or (array != np.round(array)).any():
-        raise ValueError(f"image_size must be (width, height) >= 1 in whole pixels, got {image_size}")
+        raise ValueError(f"image_size must be (width, height) >= 1 in whole pixels, got {image_size!r}")
     return int(array[0]), int(array[1])
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from importlib import import_module
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 
 from .adapters import adapter, is_adapter
 from .bayes import bayes
@@ -57,11 +57,21 @@ def load_matcher(name: str) -> Matcher:
             raise UnknownMatcherError(str(error)) from error
     installed = {point.name: point for point in entry_points(group=ENTRY_POINT_GROUP)}
     if name in installed:
-        return _callable(installed[name].load(), name)
+        return _callable(_loaded(installed[name]), name)
     if ":" in name:
         return _callable(_import(name), name)
     known = ", ".join(sorted({*METHODS, *installed}))
     raise UnknownMatcherError(f"no matcher is called {name!r}; known are {known}, or package.module:callable")
+
+
+def _loaded(point: EntryPoint) -> object:
+    try:
+        return point.load()
+    except (ImportError, AttributeError) as error:
+        package = point.dist.name if point.dist else "a package"
+        raise UnknownMatcherError(
+            f"matcher {point.name!r} of {package} cannot be loaded from {point.value!r}: {error}"
+        ) from error
 
 
 def _import(name: str) -> object:
