@@ -10,7 +10,9 @@ from typing import Any, Literal
 import numpy as np
 
 from ..envs.claims import Claims
-from ..fusion.objects import GAINS, Gain, fuse_own, group_detections
+from ..fusion.gains import fuse_own
+from ..fusion.groups import group_detections
+from ..fusion.objects import GAINS, Gain
 from ..matching import Matcher, Matching, RelativePose, load_matcher
 from ..matching.multiway import consistent
 from .perception.detections import Detections, Perceptor

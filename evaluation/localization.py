@@ -14,9 +14,9 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from ..fusion.gains import fuse_own
 from ..fusion.member import UNPROTECTED, Match, MemberOptions
 from ..fusion.metrics import displacement, gospa, identity_switches, nees
-from ..fusion.objects import fuse_own
 from ..fusion.tracking import TrackerOptions
 from ..matching import Matching, RelativePose
 from ..matching.bayes import bayes

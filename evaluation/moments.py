@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..fusion.gains import fuse
+from ..fusion.groups import Groups, group_detections
 from ..fusion.metrics import displacement_errors
-from ..fusion.objects import FusedObjects, Groups, fuse, group_detections, own_objects
+from ..fusion.objects import FusedObjects, own_objects
 from ..matching import Matching, ObjectGraph, RelativePose
 from ..matching.metrics import Counts, count, is_correct
 from ..matching.pose import Array, invert, transform

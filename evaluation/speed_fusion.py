@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..fusion.objects import fuse
+from ..fusion.gains import fuse
 from ..fusion.sequence import PairTracker
 from ..fusion.tracking import Batch, Tracker
 from ..matching import METHODS, Matching, ObjectGraph, RelativePose

@@ -4,20 +4,12 @@ from covis.fusion import fuse, fuse_own, register
 """
 
 from .channel import Channel, ChannelOptions
+from .gains import fuse, fuse_own
 from .gaussian import Gaussian, covariance_intersection, fuse_gaussians, fuse_isotropic, fused_variance, fusion_gains
+from .groups import Groups, group_detections
 from .localmap import LocalMap, MapOptions
 from .member import UNPROTECTED, Localized, Member, MemberOptions, Report
-from .objects import (
-    FusedObjects,
-    Groups,
-    OwnObjects,
-    agreement,
-    fuse,
-    fuse_own,
-    group_detections,
-    own_objects,
-    relative_pose,
-)
+from .objects import FusedObjects, OwnObjects, agreement, own_objects, relative_pose
 from .refine import Refined, refine
 from .registration import RegistrationError, register
 from .sequence import PairOptions, PairTracker

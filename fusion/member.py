@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from ..matching.graph import Matching, ObjectGraph
 from ..matching.pose import Array, RelativePose, adjoint, exp_se3, invert, transform
 from .channel import BYTES_PER_NUMBER, message_size
-from .objects import FusedObjects, Gain, OwnObjects, agreement, fuse, own_objects
+from .gains import fuse
+from .objects import FusedObjects, Gain, OwnObjects, agreement, own_objects
 from .registration import log_se3
 from .tracking import Batch, Tracker, TrackerOptions
 

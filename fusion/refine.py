@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from ..matching.graph import Matching, ObjectGraph
 from ..matching.pose import Array, RelativePose, adjoint, exp_se3, invert
-from .objects import FusedObjects, Groups, fuse, group_detections, relative_pose
+from .groups import Groups, group_detections
+from .objects import FusedObjects, fuse_given, relative_pose
 from .registration import RegistrationError, log_se3, register_points, rotation_between
 
 FLOOR = 1e-10
@@ -68,7 +69,7 @@ def refine(
     problem = _Problem.build(graphs, groups, placed, frame)
     if gate is not None:
         start = {(frame, j): RelativePose(T[j], _known_covariance(poses, frame, j)) for j in placed if j != frame}
-        kept = fuse(graphs, start, groups, frame=frame, gate=gate)
+        kept = fuse_given(graphs, start, groups, frame=frame, gate=gate)
         problem = _Problem.build(graphs, _only(kept, groups), placed, frame)
     factors = [(i, j, pose) for (i, j), pose in poses.items() if i in T and j in T]
     solver = _Solver(problem, factors, huber)

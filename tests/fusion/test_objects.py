@@ -1,9 +1,11 @@
 import numpy as np
 import pytest
 
+from covis.fusion.gains import fuse, fuse_own
 from covis.fusion.gaussian import fuse_gaussians, fuse_isotropic
+from covis.fusion.groups import group_detections
 from covis.fusion.metrics import nees_per_dof
-from covis.fusion.objects import fuse, fuse_own, group_detections, relative_pose
+from covis.fusion.objects import relative_pose
 from covis.matching.graph import Matching, ObjectGraph
 from covis.matching.pose import RelativePose, exp_se3, invert, transform
 

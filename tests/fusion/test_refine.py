@@ -2,8 +2,10 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from covis.fusion.gains import fuse, fuse_own
+from covis.fusion.groups import group_detections
 from covis.fusion.metrics import nees_per_dof
-from covis.fusion.objects import agreement, fuse, fuse_own, group_detections
+from covis.fusion.objects import agreement
 from covis.fusion.refine import refine
 from covis.fusion.registration import log_se3, register
 from covis.matching.graph import Matching, ObjectGraph
