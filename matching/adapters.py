@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from .candidates import MAX_CANDIDATES, affinity_matrix, check_size, distance_variance_m2, mean_agreement
+from .candidates import MAX_CANDIDATES, affinity_matrix, assignment, check_size, distance_variance_m2, mean_agreement
 from .graph import Matcher, Matching, ObjectGraph, check_comparable
 from .pose import Array, RelativePose
 from .rrwm import distance_width
@@ -41,6 +41,8 @@ def adapter(name: str) -> Matcher:
     if solver not in PYGM_SOLVERS:
         raise ValueError(f"no pygmtools solver is called {solver!r}; known are {', '.join(PYGM_SOLVERS)}")
     _need("pygmtools", "pygmtools", name)
+    if solver == "ngm":
+        _need("torch", "torch", name)
     return partial(pygm, solver=solver)
 
 
@@ -71,6 +73,10 @@ def pygm(
 
     Returns:
         min(n, n') matches, each scored by its mean affinity with the others.
+
+    Raises:
+        ValueError: a parameter out of range, too many objects, different attribute classes.
+        RuntimeError: the weights of "ngm" are neither there nor to be had; its option `pretrain=False` does without.
     """
     check_comparable(source, target, prior)
     check_size(f"pygm:{solver}", source, target, MAX_CANDIDATES)
@@ -80,9 +86,11 @@ def pygm(
     s, t = distances(source.positions), distances(target.positions)
     width = distance_width(source, target, s, t, distance_width_m2, distance_width_factor)
     K = affinity_matrix(source, target, s, t, width, attribute_weight)
-    if n * m == 1 or not K.any():
-        return mean_agreement(K, np.ones((n, m)) if K.any() else np.zeros((n, m)))
-    return mean_agreement(K, solve_pygm(solver, K, n, m, **solver_options))
+    if not K.any():
+        return Matching.empty()
+    soft = np.ones((1, 1)) if n * m == 1 else solve_pygm(solver, K, n, m, **solver_options)
+    A = attribute_similarity(source.attributes, target.attributes) ** attribute_weight
+    return mean_agreement(assignment(soft), s, t, width, A)
 
 
 def solve_pygm(solver: str, K: Array, n: int, m: int, **options: Any) -> Array:
@@ -93,7 +101,12 @@ def solve_pygm(solver: str, K: Array, n: int, m: int, **options: Any) -> Array:
     if solver != "ngm":
         return _clean(getattr(package, solver)(by_columns, n1=n, n2=m, backend="numpy", **options))
     torch: Any = import_module("torch")
-    soft = package.ngm(torch.from_numpy(by_columns).float(), n1=n, n2=m, backend="pytorch", **options)
+    try:
+        soft = package.ngm(torch.from_numpy(by_columns).float(), n1=n, n2=m, backend="pytorch", **options)
+    except OSError as error:
+        raise RuntimeError(
+            f"pygm:ngm lacks its weights, which pygmtools downloads at the first use: {error}"
+        ) from error
     return _clean(soft.detach().numpy())
 
 
@@ -133,7 +146,7 @@ def kiss_matcher(
         return Matching.empty()
     p = source.positions[candidates[:, 0]].astype(np.float32)
     q = target.positions[candidates[:, 1]].astype(np.float32)
-    solver = package.KISSMatcher(package.KISSMatcherConfig(resolution_m))
+    solver = package.KISSMatcher(package.KISSMatcherConfig(resolution_m, enable_noise_bound_clamping=False))
     solution = solver.prune_and_solve(list(q), list(p))
     if not solution.valid:
         return Matching.empty()

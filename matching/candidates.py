@@ -84,13 +84,16 @@ def assignment(support: Array, scores: Array | None = None) -> Matching:
     return Matching(np.stack([rows, cols], axis=1), np.clip(scores[rows, cols], 0.0, 1.0))
 
 
-def mean_agreement(K: Array, support: Array) -> Matching:
-    """`assignment`, each match scored by its mean affinity K (n n', n n') with the other matches."""
-    matching = assignment(support)
+def mean_agreement(matching: Matching, s: Array, t: Array, width_m2: float, A: Array) -> Matching:
+    """The same matches, each scored by its mean affinity with the others, D_ab A_a A_b; those of one match as they are.
+
+    s (n, n) and t (n', n') m are distances, `width_m2` is gamma of Eq. (2), A (n, n') what candidates are weighted by.
+    """
     if len(matching) < 2:
         return matching
-    index = matching.pairs[:, 0] * support.shape[1] + matching.pairs[:, 1]
-    among = K[np.ix_(index, index)]
+    rows, cols = matching.pairs.T
+    difference = s[np.ix_(rows, rows)] - t[np.ix_(cols, cols)]
+    a = A[rows, cols]
+    among = np.exp(-(difference**2) / width_m2) * a[:, None] * a
     np.fill_diagonal(among, 0.0)
-    scores = np.clip(among.sum(axis=1) / (len(index) - 1), 0.0, 1.0)
-    return Matching(matching.pairs, scores)
+    return Matching(matching.pairs, np.clip(among.sum(axis=1) / (len(rows) - 1), 0.0, 1.0))

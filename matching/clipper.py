@@ -112,19 +112,14 @@ def densest_clique(
 ) -> NDArray[np.int64]:
     """Indices of the densest clique of M (k, k), by projected gradient ascent with the published parameters.
 
-    The ascent starts from one power step on the vector of ones.
+    The ascent starts from one power step on the vector of ones. The penalty d starts at, and grows by, the mean of what
+    would bring each violated entry of the gradient to zero, as in the authors' code since its release of 2022.
     """
-    k = len(M)
     C = (M > 0).astype(np.float64)
     u = M.sum(axis=1)
     u /= np.sqrt((u * u).sum())
     Mu, violated = M @ u, u.sum() - C @ u
-    d, found = 0.0, 0
-    for a in range(k):
-        if violated[a] > epsilon and u[a] > epsilon:
-            d += Mu[a] / violated[a]
-            found += 1
-    d /= max(found, 1)
+    d = max(_penalty_step(u, Mu, violated, epsilon), 0.0)
     F = 0.0
     for _ in range(outer_iterations):
         gradient = Mu - d * violated
@@ -151,14 +146,22 @@ def densest_clique(
             if moved < tolerance_u or abs(change) < tolerance_f:
                 break
         Mu, violated = M @ u, u.sum() - C @ u
-        growth = np.inf
-        for a in range(k):
-            if violated[a] > epsilon and u[a] > epsilon:
-                growth = min(growth, abs(Mu[a] / violated[a]))
-        if not np.isfinite(growth):
+        growth = _penalty_step(u, Mu, violated, epsilon)
+        if growth < 0.0:
             break
         d += growth
     return _consistent_largest(M, u, int(np.round(F)))
+
+
+@njit(cache=True)
+def _penalty_step(u: Array, Mu: Array, violated: Array, epsilon: float) -> float:
+    """Mean of Mu / violated where constraints are violated; -1 where none is."""
+    total, found = 0.0, 0
+    for a in range(len(u)):
+        if violated[a] > epsilon and u[a] > epsilon:
+            total += Mu[a] / violated[a]
+            found += 1
+    return total / found if found else -1.0
 
 
 @njit(cache=True)

@@ -10,7 +10,7 @@ from .candidates import extent_floor_m2
 from .graph import ObjectGraph
 from .objective import Terms
 from .pose import Array
-from .rrwm import reweighted_random_walk
+from .random_walk import reweighted_random_walk, sparse
 from .similarity import attribute_similarity, distances, pair_affinity, triangle_radius, triangle_sides, vertex_cosines
 from .uncertainty import certainty, kronecker_plus, typical
 
@@ -157,7 +157,7 @@ def support(terms: Terms) -> Array:
     n, m = terms.attribute.shape
     affinity = terms.pair.reshape(n * m, n * m).copy()
     affinity.flat[:: n * m + 1] = terms.attribute.ravel()
-    return reweighted_random_walk(affinity, n, m, iterations=30, sinkhorn_iterations=10)
+    return reweighted_random_walk(sparse(affinity), n, m, iterations=30, sinkhorn_iterations=10)
 
 
 def _or(given: float | None, default: float) -> float:

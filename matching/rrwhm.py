@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from .candidates import assignment, check_size
 from .graph import Matching, ObjectGraph, check_comparable
 from .pose import Array, RelativePose
-from .rrwm import check_walk, sinkhorn
+from .random_walk import sinkhorn
+from .rrwm import check_walk
 from .similarity import contract, nearest_triples, vertex_cosines
 
 MAX_CANDIDATES = 1024

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
-from numpy.typing import NDArray
 
-from .candidates import MAX_CANDIDATES, affinity_matrix, check_size, distance_variance_m2, mean_agreement
+from .candidates import MAX_CANDIDATES, assignment, check_size, distance_variance_m2, mean_agreement
 from .graph import Matching, ObjectGraph, check_comparable
 from .pose import Array, RelativePose
-from .similarity import distances
+from .random_walk import distance_affinity, reweighted_random_walk
+from .similarity import attribute_similarity, distances
 
 
 def rrwm(
@@ -58,9 +57,9 @@ def rrwm(
         return Matching.empty()
     s, t = distances(source.positions), distances(target.positions)
     width = distance_width(source, target, s, t, distance_width_m2, distance_width_factor)
-    K = affinity_matrix(source, target, s, t, width, attribute_weight)
+    A = attribute_similarity(source.attributes, target.attributes) ** attribute_weight
     visits = reweighted_random_walk(
-        K,
+        distance_affinity(s, t, width, A.ravel(), attribute_weight > 0),
         len(source),
         len(target),
         walk_weight,
@@ -70,7 +69,7 @@ def rrwm(
         tolerance,
         sinkhorn_tolerance,
     )
-    return mean_agreement(K, visits)
+    return mean_agreement(assignment(visits), s, t, width, A)
 
 
 def distance_width(
@@ -91,124 +90,3 @@ def check_walk(walk_weight: float, inflation: float, iterations: int, sinkhorn_i
         raise ValueError(f"inflation must be positive, got {inflation}")
     if iterations < 1 or sinkhorn_iterations < 1:
         raise ValueError(f"iterations must be at least 1, got {iterations} and {sinkhorn_iterations}")
-
-
-@njit(cache=True, fastmath=True)
-def reweighted_random_walk(
-    affinity: Array,
-    n: int,
-    m: int,
-    walk_weight: float = 0.2,
-    inflation: float = 30.0,
-    iterations: int = 300,
-    sinkhorn_iterations: int = 1000,
-    tolerance: float = 3e-13,
-    sinkhorn_tolerance: float = 1e-3,
-) -> Array:
-    """Quasi-stationary visits (n, m), summing to 1, of the walk over candidates; affinity (n m, n m).
-
-    A step walks from the mixture of the last visits (weight `walk_weight`) and of those visits inflated and made
-    bistochastic (the jump). Zero where there is no affinity at all.
-    """
-    size = n * m
-    x = np.full(size, 1.0 / size)
-    before = x.copy()
-    mixed = x.copy()
-    start, column, value = sparse(affinity)
-    for _ in range(iterations):
-        walk = multiply(start, column, value, mixed)
-        total = walk.sum()
-        if total <= 0.0:
-            return np.zeros((n, m))
-        walk /= total
-        jump = np.exp(inflation * (walk / walk.max() - 1.0)).reshape(n, m)
-        sinkhorn(jump, sinkhorn_iterations, sinkhorn_tolerance, np.exp(-inflation))
-        jump_flat = jump.reshape(size)
-        mixed = walk_weight * walk + (1.0 - walk_weight) * (jump_flat / jump_flat.sum())
-        # An oscillation between two states counts as an end, too.
-        change = min(((walk - x) ** 2).sum(), ((walk - before) ** 2).sum())
-        before[:] = x
-        x[:] = walk
-        if change < tolerance * tolerance:
-            break
-    return x.reshape(n, m)
-
-
-NEGLIGIBLE = 1e-12
-"""Affinities below this share of the largest are taken for zero: most distances do not agree at all."""
-
-
-@njit(cache=True)
-def sparse(K: Array) -> tuple[NDArray[np.int64], NDArray[np.int32], Array]:
-    """K (k, k) by rows: `start` (k + 1,) into columns and values of the entries that are not negligible."""
-    k = len(K)
-    least = NEGLIGIBLE * K.max()
-    start = np.zeros(k + 1, dtype=np.int64)
-    for a in range(k):
-        count = 0
-        for b in range(k):
-            count += K[a, b] > least
-        start[a + 1] = start[a] + count
-    # Every entry is written and the next overwrites it if negligible: branches would be guessed wrongly too often.
-    column, value = np.empty(start[k] + 1, dtype=np.int32), np.empty(start[k] + 1)
-    for a in range(k):
-        at = start[a]
-        for b in range(k):
-            column[at], value[at] = b, K[a, b]
-            at += K[a, b] > least
-    return start, column[:-1], value[:-1]
-
-
-@njit(cache=True, fastmath=True)
-def multiply(start: NDArray[np.int64], column: NDArray[np.int32], value: Array, x: Array) -> Array:
-    """The sparse matrix times x (k,)."""
-    out = np.empty(len(x))
-    for a in range(len(x)):
-        total = 0.0
-        # Unsigned, since an index that might count from the end keeps the compiler from using vector instructions.
-        for at in range(np.uint64(start[a]), np.uint64(start[a + 1])):
-            total += value[at] * x[np.uint64(column[at])]
-        out[a] = total
-    return out
-
-
-@njit(cache=True, fastmath=True)
-def sinkhorn(X: Array, iterations: int, tolerance: float = 0.0, slack: float = 0.0) -> None:
-    """Normalise the rows and columns of X (n, m) in turn, in place.
-
-    Where n and m differ, |n - m| slack rows (or columns) of equal entries `slack` join in, so that rows and columns can
-    sum to 1 at once; as equals they stay equal, so one stands for all.
-    """
-    n, m = X.shape
-    extra = np.full(max(n, m), slack)
-    column = np.empty(m)
-    for _ in range(iterations):
-        change = 0.0
-        column[:] = 1e-300
-        for i in range(n):
-            total = 1e-300
-            for j in range(m):
-                total += X[i, j]
-            if n > m:
-                total += (n - m) * extra[i]
-                extra[i] /= total
-            for j in range(m):
-                X[i, j] /= total
-                column[j] += X[i, j]
-            change = max(change, abs(total - 1.0))
-        if m > n:
-            total = max(extra[:m].sum(), 1e-300)
-            for j in range(m):
-                extra[j] /= total
-                column[j] += (m - n) * extra[j]
-                extra[j] /= column[j]
-        elif n > m:
-            total = max(extra[:n].sum(), 1e-300)
-            extra[:n] /= total
-        for j in range(m):
-            column[j] = 1.0 / column[j]
-        for i in range(n):
-            for j in range(m):
-                X[i, j] *= column[j]
-        if change < tolerance:
-            break

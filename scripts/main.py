@@ -14,6 +14,7 @@ from .report import report
 from .sensitivity import sensitivity
 from .speed import speed
 from .train import app as train
+from .tune import tune
 from .view import view
 
 app = typer.Typer(
@@ -32,6 +33,7 @@ app.command()(view)
 app.command()(localize)
 app.command()(speed)
 app.command()(sensitivity)
+app.command()(tune)
 app.add_typer(import_data, name="import")
 app.add_typer(export_data, name="export")
 app.add_typer(train, name="train")

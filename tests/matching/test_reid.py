@@ -1,5 +1,7 @@
 """Appearance alone."""
 
+from itertools import permutations
+
 import numpy as np
 import pytest
 
@@ -13,6 +15,18 @@ def test_distinct_classes_find_each_other():
     matching = reid(source, target)
     assert {tuple(p) for p in matching.pairs.tolist()} == {(2, 0), (0, 1), (1, 2)}
     np.testing.assert_allclose(matching.scores, 1.0)
+
+
+@pytest.mark.parametrize(("n", "m"), [(4, 4), (3, 4), (4, 2)])
+def test_total_similarity_is_the_largest_of_all_assignments(n, m):
+    rng = np.random.default_rng(n + m)
+    for _ in range(10):
+        a, b = rng.dirichlet(np.ones(3), n), rng.dirichlet(np.ones(3), m)
+        found = reid(*(ObjectGraph.from_positions(np.zeros((len(x), 3)), attributes=x) for x in (a, b)))
+        A = (a @ b.T) / np.linalg.norm(a, axis=1)[:, None] / np.linalg.norm(b, axis=1)
+        few, many = (A, A.T)[n > m], max(n, m)
+        best = max(few[np.arange(min(n, m)), list(cols)].sum() for cols in permutations(range(many), min(n, m)))
+        assert found.scores.sum() == pytest.approx(best)
 
 
 def test_embedding_decides_where_both_have_one():

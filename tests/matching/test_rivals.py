@@ -9,11 +9,12 @@ from covis.matching import ObjectGraph, bcagm, clipper, icp, mos, rrwhm, rrwm
 from covis.matching.bcagm import block_ascent, convexity_bound, lifted_gradient
 from covis.matching.candidates import affinity_matrix
 from covis.matching.clipper import consistency, densest_clique
-from covis.matching.icp import rigid, spread_rotations
+from covis.matching.icp import _starts, align, rigid, spread_rotations
 from covis.matching.pose import rotation_from_vector
+from covis.matching.random_walk import distance_affinity, reweighted_random_walk, sinkhorn, sparse
 from covis.matching.rrwhm import triples
-from covis.matching.rrwm import reweighted_random_walk, sinkhorn
 from covis.matching.similarity import (
+    attribute_similarity,
     contract,
     distances,
     nearest_triples,
@@ -82,7 +83,31 @@ def test_walk_is_the_published_iteration_in_numpy():
             jump /= jump.sum(axis=1, keepdims=True)
             jump /= jump.sum(axis=0, keepdims=True)
         mixed = c * walk + (1 - c) * jump.ravel() / jump.sum()
-    np.testing.assert_allclose(reweighted_random_walk(K, 4, 4, c, beta, steps, 11, 0.0, 0.0).ravel(), walk, atol=1e-12)
+    np.testing.assert_allclose(
+        reweighted_random_walk(sparse(K), 4, 4, c, beta, steps, 11, 0.0, 0.0).ravel(), walk, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("exponent", [0.0, 1.0, 3.0])
+@pytest.mark.parametrize("shape", [(7, 7), (4, 9), (9, 4), (1, 5), (1, 1)])
+def test_sparse_affinity_is_the_dense_one(shape, exponent):
+    rng = np.random.default_rng(3)
+    kinds = np.vstack([np.eye(3), rng.dirichlet(np.ones(3), 9)])  # some have no class in common
+    source, target = (
+        ObjectGraph.from_positions(rng.uniform(-5, 5, (n, 3)).round(1), attributes=rng.permutation(kinds)[:n])
+        for n in shape
+    )
+    s, t = distances(source.positions), distances(target.positions)
+    A = attribute_similarity(source.attributes, target.attributes) ** exponent
+    dense_one = affinity_matrix(source, target, s, t, 0.3, exponent)
+    start, column, value = distance_affinity(s, t, 0.3, A.ravel(), exponent > 0)
+    found = np.zeros_like(dense_one)
+    for row in range(len(found)):
+        here = slice(start[row], start[row + 1])
+        assert len(set(column[here])) == len(column[here])
+        found[row, column[here]] = value[here]
+    np.testing.assert_allclose(found, dense_one, atol=1e-12)
+    assert len(value) <= (dense_one > 1e-13).sum() + len(found)
 
 
 def test_rrwm_reaches_the_optimum_of_its_affinity_on_small_problems():
@@ -180,6 +205,27 @@ def test_mos_uses_every_order():
         mos(source, moved, order_weights=(0, 0, 0))
 
 
+def test_mos_reaches_the_optimum_of_its_three_orders_on_small_problems():
+    """The largest sum of first, second and third order, each normalised by its largest degree and weighted."""
+    ratios = []
+    for seed in range(30):
+        source, target, _ = small(seed)
+        K = affinity_matrix(source, target, distances(source.positions), distances(target.positions), 0.18, 0.0)
+        T = dense(*triples(source, target, 1.0, None), 16)
+        u = np.full(16, 1 / 16)
+        third = T / np.einsum("abc,b,c", T, u, u).max()
+
+        def score(match, K=K, third=third, u=u):
+            x = indicator(match, 4)
+            return x.sum() + x @ K @ x / (K @ u).max() + 0.3 * np.einsum("abc,a,b,c", third, x, x, x)
+
+        best = max(score(m) for m in permutations(range(4)))
+        found = mos(source, target, distance_width_m2=0.18).pairs
+        ratios.append(score(found[:, 1]) / best)
+    assert np.mean(np.array(ratios) > 1 - 1e-9) >= 0.6
+    assert np.mean(ratios) > 0.85
+
+
 def as_list(matching):
     return sorted(matching.pairs.tolist())
 
@@ -199,6 +245,71 @@ def test_consistency_is_zero_for_conflicts_and_beyond_epsilon():
     close = consistency(s, s * 1.3, candidates, 0.2, 0.6, 0.0)
     assert close[0, 4] == pytest.approx(np.exp(-0.5 * 0.3**2 / 0.2**2))
     assert consistency(s, s, candidates, 0.2, 0.6, 2.0)[0, 4] == 0  # closer than the least distance
+
+
+def published_clique(M, outer_iterations=1000, inner_iterations=200):
+    """Lusk, Fathian and How's projected gradient ascent with a homotopy in d, in dense matrices."""
+    conflict = (M == 0).astype(float)
+    u = M @ np.ones(len(M))
+    u /= np.linalg.norm(u)
+
+    def ratios():
+        violated = (conflict @ u > 1e-9) & (u > 1e-9)
+        return (M @ u)[violated] / (conflict @ u)[violated]
+
+    d = ratios().mean() if len(ratios()) else 0.0
+    for _ in range(outer_iterations):
+        M_d = M - d * conflict
+        for _ in range(inner_iterations):
+            before, step = u, 1.0
+            while True:
+                u = np.maximum(before + step * (M_d @ before), 0)
+                u /= np.linalg.norm(u)
+                change = u @ M_d @ u - before @ M_d @ before
+                if change >= -1e-9:
+                    break
+                step *= 0.25
+            if np.linalg.norm(u - before) < 1e-8 or abs(change) < 1e-9:
+                break
+        if len(ratios()) == 0:
+            break
+        d += ratios().mean()
+    return sorted(np.argsort(-u)[: round(u @ M_d @ u)].tolist())
+
+
+def test_densest_clique_is_the_published_ascent():
+    rng = np.random.default_rng(4)
+    same = 0
+    for _ in range(30):
+        source, target, _ = small(int(rng.integers(1000)), n=5, noise=0.5)
+        s, t = distances(source.positions), distances(target.positions)
+        M = consistency(s, t, np.argwhere(np.ones((5, 5))), 0.5, 1.5, 0.0)
+        expected = published_clique(M)
+        # The published rounding may take candidates that contradict each other; ours passes over them.
+        among = M[np.ix_(expected, expected)]
+        if (among > 0).all():
+            assert sorted(densest_clique(M).tolist()) == expected
+            same += 1
+    assert same >= 20
+
+
+def test_densest_clique_is_that_of_the_enumeration_on_small_problems():
+    """u^T M u over cliques is at most the first eigenvalue of a clique's block; rounding keeps that many members."""
+    hits = 0
+    for seed in range(40):
+        source, target, _ = small(seed)
+        s, t = distances(source.positions), distances(target.positions)
+        M = consistency(s, t, np.argwhere(np.ones((4, 4))), 0.6, 1.8, 0.0)
+        density = {
+            members: np.linalg.eigvalsh(M[np.ix_(members, members)])[-1]
+            for size in range(1, 5)
+            for members in combinations(range(16), size)
+            if (M[np.ix_(members, members)] > 0).all()
+        }
+        best = max(density, key=density.get)
+        found = densest_clique(M).tolist()
+        hits += set(found) <= set(best) and len(found) == round(density[best])
+    assert hits >= 34
 
 
 def test_densest_clique_of_a_planted_clique():
@@ -256,6 +367,22 @@ def test_icp_aligns_views_that_overlap_throughout(translations):
     found = icp(source, target, translations=translations, restarts=200, gate_m=0.5)
     assert (truth[found.pairs[:, 0]] == found.pairs[:, 1]).all()
     assert len(found) == 8
+
+
+def test_icp_finds_the_alignment_of_least_error_on_small_problems():
+    """Against the best rigid fit over every way of sending the target's points to the source's."""
+    reached = 0
+    for seed in range(20):
+        source, target, _ = small(seed, noise=0.1)
+        p, q = source.positions, target.positions
+
+        def error(R, t, p=p, q=q):
+            return (np.linalg.norm(p[:, None] - (q @ R.T + t)[None], axis=2).min(axis=0) ** 2).mean()
+
+        best = min(error(*rigid(p[list(match)], q)) for match in permutations(range(4)))
+        R, t = align(p, q, *_starts(source, target, None, 60, "objects"), 50, 1e-6, 20.0, np.inf, 0.0)
+        reached += error(R, t) <= best + 1e-6
+    assert reached >= 18
 
 
 def test_icp_starts_from_the_prior_if_there_is_one():

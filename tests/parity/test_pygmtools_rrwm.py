@@ -9,9 +9,9 @@ import pytest
 
 from covis.matching import load_matcher
 from covis.matching.candidates import affinity_matrix
-from covis.matching.rrwm import reweighted_random_walk
+from covis.matching.random_walk import reweighted_random_walk, sparse
 from covis.matching.similarity import distances
-from covis.matching.testing import check_matcher, scene
+from covis.matching.testing import check_matcher, check_well_formed, degenerate_problems, scene
 
 pygm = pytest.importorskip("pygmtools", reason="pygmtools is not installed")
 
@@ -30,13 +30,36 @@ def test_same_walk(seed, alpha):
     soft = np.asarray(pygm.rrwm(by_columns, n1=n, n2=n, **options))
     walk = K @ soft.ravel()
     share = (1 - alpha) / (1 - alpha + n * alpha)
-    ours = reweighted_random_walk(K, n, n, share, 30.0, steps + 1, half_steps // 2, 0.0, 0.0)
+    ours = reweighted_random_walk(sparse(K), n, n, share, 30.0, steps + 1, half_steps // 2, 0.0, 0.0)
     np.testing.assert_allclose(ours.ravel(), walk / walk.sum(), atol=1e-9)
 
 
 @pytest.mark.parametrize("solver", ["rrwm", "sm", "ipfp"])
 def test_adapter_keeps_the_contract(solver):
     check_matcher(load_matcher(f"pygm:{solver}"), min_f1=0.5, invariant=False)
+
+
+def test_the_learned_solver_answers_every_problem():
+    """Untrained weights: they need no network connection, and say nothing about quality."""
+    torch = pytest.importorskip("torch")
+    matcher = load_matcher("pygm:ngm")
+    for problem in [*degenerate_problems(), scene(np.random.default_rng(0))]:
+        torch.manual_seed(0)
+        found = matcher(problem.source, problem.target, pretrain=False)
+        check_well_formed(found, problem.source, problem.target, problem.name)
+    assert len(found) == 8
+
+
+def test_a_learned_solver_without_weights_says_so(monkeypatch):
+    pytest.importorskip("torch")
+
+    def no_connection(*args, **kwargs):
+        raise FileNotFoundError("ngm_voc_pytorch.pt")
+
+    monkeypatch.setattr(pygm, "ngm", no_connection)
+    problem = scene(np.random.default_rng(0))
+    with pytest.raises(RuntimeError, match=r"pygm:ngm lacks its weights.* ngm_voc_pytorch\.pt"):
+        load_matcher("pygm:ngm")(problem.source, problem.target)
 
 
 def test_unknown_solver_is_refused_by_name():
