@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -36,28 +36,35 @@ class Growth:
 
 
 def rows(
-    progress: Callable[[int, int], None] = lambda done, total: None, *, resets: int = RESETS, steps: int = STEPS
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    *,
+    resets: int = RESETS,
+    steps: int = STEPS,
+    scenes: Sequence[str] = tuple(SCENES),
 ) -> list[dict[str, Any]]:
     """One row `memory_<scene>` each: MiB after at least so many resets and steps, against MiB after the first 100.
 
     `n` is the number of steps; `files_left_open` counts file descriptors.
 
     Raises:
-        ValueError: fewer than one reset or step.
+        ValueError: fewer than one reset or step, or a scene that does not exist.
         RuntimeError: the operating system does not tell a process's memory.
     """
     for name, value in (("resets", resets), ("steps", steps)):
         if value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}")
+    unknown = [scene for scene in scenes if scene not in SCENES]
+    if unknown:
+        raise ValueError(f"no scene is called {unknown[0]!r}; there are {', '.join(SCENES)}")
     if not STATUS.exists():
         raise RuntimeError("memory is measured on Linux only: there is no /proc here")
     out = []
-    for i, scene in enumerate(SCENES):
-        progress(i, len(SCENES))
+    for i, scene in enumerate(scenes):
+        progress(i, len(scenes))
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
             grown = pool.submit(growth, scene, resets, steps).result()
         out.append(_row(scene, grown))
-    progress(len(SCENES), len(SCENES))
+    progress(len(scenes), len(scenes))
     return out
 
 

@@ -37,12 +37,17 @@ def speed(
     ] = False,
     resets: Annotated[int, typer.Option(help="envs --memory: resets of each scene.")] = 1_000,
     steps: Annotated[int, typer.Option(help="envs --memory: steps of each scene.")] = 100_000,
+    scene: Annotated[
+        list[str] | None, typer.Option(help="envs --memory: only this scene; may be given several times.")
+    ] = None,
 ) -> None:
     """Rates per second against peers, side by side in this process, on one thread."""
     if area not in AREAS:
         fail(f"no area is called {area!r}; there are {', '.join(AREAS)}")
     if memory and area not in MEMORY:
         fail(f"--memory is for {' and '.join(MEMORY)}, not for {area}")
+    if scene and not (memory and area == "envs"):
+        fail(f"--scene is for envs --memory, not for {area}{' --memory' if memory else ''}")
     if figure is not None and (memory or area != "matching"):
         fail(f"--figure is for matching without --memory, not for {area}{' --memory' if memory else ''}")
     module, extra = AREAS[area]
@@ -54,7 +59,8 @@ def speed(
             require(extra)
         if memory:
             measure = import_module(f"covis.evaluation.{MEMORY[area]}").rows
-            measure = partial(measure, resets=resets, steps=steps) if area == "envs" else measure
+            if area == "envs":
+                measure = partial(measure, resets=resets, steps=steps, **({"scenes": scene} if scene else {}))
         else:
             measure = import_module(f"covis.evaluation.{module}").rows
         if figure is not None:

@@ -67,6 +67,8 @@ def test_memory_refuses_nothing_to_do():
 
     with pytest.raises(ValueError, match="resets must be at least 1, got 0"):
         memory_envs.rows(resets=0)
+    with pytest.raises(ValueError, match="no scene is called 'mars'; there are"):
+        memory_envs.rows(scenes=("mars",))
 
 
 def test_memory_is_for_environments_and_matching():
