@@ -97,9 +97,9 @@ def decode(agent: str, action: Any, space: spaces.Dict) -> tuple[NDArray[np.floa
     """
     if not isinstance(action, Mapping):
         raise ValueError(f"{agent}: the action must be a dict of leaves, got {type(action).__name__}")
-    unknown = sorted(set(action) - set(space.spaces))
+    unknown = action.keys() - space.spaces.keys()
     if unknown:
-        raise ValueError(f"{agent}: the action has no leaf {unknown[0]!r}; it has {', '.join(space.spaces)}")
+        raise ValueError(f"{agent}: the action has no leaf {min(unknown, key=str)!r}; it has {', '.join(space.spaces)}")
     leaf = {name: _leaf(agent, name, action, leaf_space) for name, leaf_space in space.spaces.items()}
     K = len(leaf["position_variance"])
     return leaf["control"], Claims(

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
@@ -100,11 +101,11 @@ class StepScore:
     error_fused: Array
     object_error: Array
 
-    @property
+    @cached_property
     def counts(self) -> Counts:
         return sum((p.counts for p in self.pairs), Counts())
 
-    @property
+    @cached_property
     def n_visible(self) -> int:
         return sum(p.n_visible for p in self.pairs)
 
@@ -140,11 +141,12 @@ def score(claims: Sequence[Claims], truth: Truth) -> StepScore:
     pairs = tuple(_score_pair(a, b, claims, tied, visible) for a, b in combinations(range(len(claims)), 2))
     matched = np.zeros(tied.shape, dtype=bool)
     for pair in pairs:
-        right = pair.assertions[pair.hits]
-        matched[pair.a, right[:, 0]] = True
-        matched[pair.b, right[:, 1]] = True
+        if pair.counts.correct:
+            right = pair.assertions[pair.hits]
+            matched[pair.a, right[:, 0]] = True
+            matched[pair.b, right[:, 1]] = True
     single = np.full(tied.shape, np.nan)
-    fused = np.full(tied.shape, np.nan)
+    fused = single.copy()
     object_error = np.full(len(truth.identity), np.inf)
     for i, claim in enumerate(claims):
         slots = np.flatnonzero(tied[i] >= 0)
@@ -168,24 +170,25 @@ def _score_pair(
     backward, backward_scores = claims[b].matches[a], claims[b].match_scores[a]
     K = len(forward)
     asserted: dict[tuple[int, int], float] = {}
-    for k in np.flatnonzero(forward < K):
-        asserted[int(k), int(forward[k])] = float(forward_scores[k])
-    for k in np.flatnonzero(backward < K):
-        key = int(backward[k]), int(k)
+    for k in (forward < K).nonzero()[0].tolist():
+        asserted[k, int(forward[k])] = float(forward_scores[k])
+    for k in (backward < K).nonzero()[0].tolist():
+        key = int(backward[k]), k
         asserted[key] = max(asserted.get(key, 0.0), float(backward_scores[k]))
-    slots = np.array(list(asserted), dtype=np.int64).reshape(-1, 2)
+    common = set(tied[a].tolist()) & set(tied[b].tolist()) - {-1}
+    n_visible = int(np.count_nonzero(visible[a] & visible[b]))
+    if not asserted:
+        return PairScore(a, b, Counts(0, 0, len(common)), n_visible, *_nothing())
+    slots = np.array(list(asserted), dtype=np.int64)
     object_a, object_b = tied[a, slots[:, 0]], tied[b, slots[:, 1]]
     hits = (object_a == object_b) & (object_a >= 0)
-    common = set(tied[a].tolist()) & set(tied[b].tolist()) - {-1}
-    return PairScore(
-        a,
-        b,
-        Counts(int(np.count_nonzero(hits)), len(slots), len(common)),
-        int(np.count_nonzero(visible[a] & visible[b])),
-        slots,
-        hits,
-        np.array(list(asserted.values())),
-    )
+    counts = Counts(int(np.count_nonzero(hits)), len(slots), len(common))
+    return PairScore(a, b, counts, n_visible, slots, hits, np.array(list(asserted.values())))
+
+
+def _nothing() -> tuple[NDArray[np.int64], NDArray[np.bool_], Array]:
+    """Slots, hits and scores of no assertion."""
+    return np.zeros((0, 2), dtype=np.int64), np.zeros(0, dtype=bool), np.zeros(0)
 
 
 @njit(cache=True)

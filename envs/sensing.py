@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import cos, sin, sqrt
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from ..matching.pose import Array, exp_se3, invert
+from ..matching.pose import Array
 
 MAX_DEPTH_M = 1000.0
 """Depth images report the sky at this depth."""
@@ -43,24 +45,73 @@ class PoseNoise:
 
     def pose(self, T_world_camera: Array, rng: np.random.Generator) -> Array:
         """A reported pose (4, 4)."""
-        up = up_in_camera(T_world_camera)
-        xi = np.concatenate([rng.normal(0, self.position_m, 3), rng.normal(0, self.heading_rad) * up])
-        # Right perturbation of the report: truth = reported * exp(xi), as the covariance is understood.
-        return T_world_camera @ invert(exp_se3(xi))
+        normal = rng.standard_normal(4)
+        return _reported(T_world_camera, self.position_m, self.heading_rad, normal)
 
     def odometry(self, T_world_last: Array, T_world_now: Array, rng: np.random.Generator) -> Array:
         """Reported own motion (4, 4): the present camera frame in the last one."""
-        motion = invert(T_world_last) @ T_world_now
-        distance = float(np.linalg.norm(motion[:3, 3]))
-        up = up_in_camera(T_world_now)
-        shift = rng.normal(0, self.odometry_position, 3) * distance
-        turn = rng.normal(0, self.odometry_heading_rad) * up
-        return motion @ exp_se3(np.concatenate([shift, turn]))
+        normal = rng.standard_normal(4)
+        return _travelled(T_world_last, T_world_now, self.odometry_position, self.odometry_heading_rad, normal)
 
 
 def up_in_camera(T_world_camera: Array) -> Array:
     """Unit vector against gravity (3,), camera frame."""
     return np.ascontiguousarray(T_world_camera[2, :3])
+
+
+@njit(cache=True)
+def _reported(T, position_m, heading_rad, normal):  # type: ignore[no-untyped-def]
+    """A pose (4, 4) with errors drawn as standard normal numbers (4,), of the position and about the vertical.
+
+    The error is a right perturbation of the report, truth = reported * exp(xi), as the covariance is understood.
+    """
+    angle = heading_rad * normal[3]
+    turn = _rotation(T[2, 0] * angle, T[2, 1] * angle, T[2, 2] * angle)
+    out = np.zeros((4, 4))
+    out[3, 3] = 1.0
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = T[i, 0] * turn[j, 0] + T[i, 1] * turn[j, 1] + T[i, 2] * turn[j, 2]
+        shift = position_m * (out[i, 0] * normal[0] + out[i, 1] * normal[1] + out[i, 2] * normal[2])
+        out[i, 3] = T[i, 3] - shift
+    return out
+
+
+@njit(cache=True)
+def _travelled(T_last, T_now, position, heading_rad, normal):  # type: ignore[no-untyped-def]
+    """The pose (4, 4) of the present in the last frame, the motion's errors drawn as `_reported` takes them."""
+    motion, moved = np.empty((3, 3)), np.empty(3)
+    for i in range(3):
+        for j in range(3):
+            motion[i, j] = T_last[0, i] * T_now[0, j] + T_last[1, i] * T_now[1, j] + T_last[2, i] * T_now[2, j]
+        moved[i] = 0.0
+        for k in range(3):
+            moved[i] += T_last[k, i] * (T_now[k, 3] - T_last[k, 3])
+    error = position * sqrt(moved[0] ** 2 + moved[1] ** 2 + moved[2] ** 2)
+    angle = heading_rad * normal[3]
+    turn = _rotation(T_now[2, 0] * angle, T_now[2, 1] * angle, T_now[2, 2] * angle)
+    out = np.zeros((4, 4))
+    out[3, 3] = 1.0
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = motion[i, 0] * turn[0, j] + motion[i, 1] * turn[1, j] + motion[i, 2] * turn[2, j]
+        shift = motion[i, 0] * normal[0] + motion[i, 1] * normal[1] + motion[i, 2] * normal[2]
+        out[i, 3] = moved[i] + error * shift
+    return out
+
+
+@njit(cache=True)
+def _rotation(x, y, z):  # type: ignore[no-untyped-def]
+    """`matching.pose.rotation_from_vector` of (x, y, z)."""
+    angle = sqrt(x * x + y * y + z * z)
+    s, c = (1.0, 0.5) if angle < 1e-8 else (sin(angle) / angle, (1.0 - cos(angle)) / angle**2)
+    return np.array(
+        [
+            [1.0 - c * (y * y + z * z), c * x * y - s * z, c * x * z + s * y],
+            [c * x * y + s * z, 1.0 - c * (x * x + z * z), c * y * z - s * x],
+            [c * x * z - s * y, c * y * z + s * x, 1.0 - c * (x * x + y * y)],
+        ]
+    )
 
 
 def permuted_instances(
