@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
 from .camera.effects import EffectRanges
+from .camera.frame import Frame as CameraFrame
+from .camera.frame import Memory
 from .camera.mount import Mount, checked_mounts, kept_picture, with_mounts
-from .camera.raster import Frame as CameraFrame
 from .camera.raster import Look, intrinsics_from_fov
 from .camera.rig import CameraRig, Exposures
 from .claims import Claims, action_space, decode
@@ -206,8 +207,16 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         self.intrinsics = np.stack([intrinsics_from_fov(self.width, self.height, fov) for fov in views])
         self._seeds = EpisodeSeeds.start(seed)
         self._rig = CameraRig(
-            self.world.meshes, self.width, self.height, self.intrinsics, backend=backend, look=look, effects=effects
+            self.world.meshes,
+            self.width,
+            self.height,
+            self.intrinsics,
+            backend=backend,
+            look=look,
+            effects=effects,
+            own_body=[m is not None and m.own_body for m in self.mounts],
         )
+        self._images = Memory(3 * self.width * self.height)
         self._painter: Any = None
         self._window: Any = None
         self._episode: _Episode | None = None
@@ -432,7 +441,8 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         up = up_in_camera(T)
         out: dict[str, NDArray[Any]] = {}
         if "image" in self.sensors:
-            out["image"] = frame.rgb.copy()
+            out["image"] = self._images.take().reshape(frame.rgb.shape)
+            out["image"][:] = frame.rgb
         out["intrinsics"] = self.intrinsics[i].astype(np.float32)
         out["pose"] = self.pose_noise.pose(T, episode.noise_rng).astype(np.float32)
         out["pose_covariance"] = self.pose_noise.covariance(up).astype(np.float32)
@@ -569,12 +579,13 @@ def _sums(result: StepScore) -> NDArray[np.float64]:
     """Per robot (N, 7): the team's correct, retrieved, covisible, visible; own single and fused error (m), number."""
     counts = result.counts
     team = (counts.correct, counts.retrieved, counts.common, result.n_visible)
-    localized = ~np.isnan(result.error_single)
-    out = np.empty((len(localized), N_SUMS))
+    out = np.zeros((len(result.tied), N_SUMS))
     out[:, :4] = team
-    out[:, 4] = np.where(localized, result.error_single, 0.0).sum(axis=1)
-    out[:, 5] = np.where(localized, result.error_fused, 0.0).sum(axis=1)
-    out[:, 6] = localized.sum(axis=1)
+    if counts.correct:
+        localized = ~np.isnan(result.error_single)
+        out[:, 4] = np.where(localized, result.error_single, 0.0).sum(axis=1)
+        out[:, 5] = np.where(localized, result.error_fused, 0.0).sum(axis=1)
+        out[:, 6] = localized.sum(axis=1)
     return out
 
 

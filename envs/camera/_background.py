@@ -17,7 +17,10 @@ NOISE_SHIFT = 4096.0
 """Metres added before indexing the tile, a multiple of its period, so that indices are positive near the origin."""
 
 SHORT_RUN = 8
-"""Bodies that hide fewer pixels of a row than this do not interrupt its colouring."""
+"""Bodies that hide fewer pixels beside each other than this do not interrupt a row's colouring."""
+
+FEW = 48
+"""Bodies that hide fewer pixels of a row than this do not either: looking for them costs as much as colouring them."""
 
 FAST = {"contract", "arcp", "nsz"}
 
@@ -50,7 +53,8 @@ def draw_background(  # type: ignore[no-untyped-def]
     from_sky = f32(light[3] * (1.15 + 0.15 * light[2]) / max(lit, 1e-9))
     shades = np.empty(width, np.float32)
     cells = np.empty((2, width), np.uint32)
-    hidden = np.empty(width, np.uint8)
+    # Flat ground is coloured faster than one could look for where it is hidden.
+    few = FEW if look[3] > 0.0 or clouds > 0.0 else width + 1
     for row in range(height):
         du, dv = (offset_u - cx) / fx, (row + offset_v - cy) / fy
         ray_x = f32(camera[2] + camera[1] * dv + camera[0] * du)
@@ -73,10 +77,10 @@ def draw_background(  # type: ignore[no-untyped-def]
             _ground_depth(iz_0 + iz_step * c, iz_step, depth[row, first:last])
         near_first = (ray_x + step[0] * c, ray_y + step[1] * c)
         sky_start, sky_stop = (0, first) if first > 0 else (last, width)
-        _hide(inverse_depth[row], depth[row], hidden, spans[row, 0], spans[row, 1])
+        whole = _hide(inverse_depth[row], depth[row], spans[row, 0], spans[row, 1]) < few
         stop = 0
         while stop < width:
-            start, stop = _next_run(hidden, stop)
+            start, stop = (0, width) if whole else _next_run(inverse_depth[row], stop, spans[row, 0], spans[row, 1])
             if start < first:
                 end = min(stop, first)
                 _sky(ray_z, step[2], blue, far, start, end - start, rgb[row, 3 * start : 3 * end])
@@ -104,31 +108,39 @@ def draw_background(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
-def _hide(inverse_depth, depth, hidden, start, stop):  # type: ignore[no-untyped-def]
-    """Note in a row which pixels bodies hide, 1 or 0, and take away the bodies that are behind the ground."""
+def _hide(inverse_depth, depth, start, stop):  # type: ignore[no-untyped-def]
+    """Take away the bodies of a row that are behind the ground; returns how many pixels the others hide."""
     one, zero = np.float32(1.0), np.float32(0.0)
-    hidden[:] = 0
+    hidden = np.int32(0)
     if start >= stop:
-        return
-    iz, ground, out = inverse_depth[start:stop], depth[start:stop], hidden[start:stop]
-    for c in range(len(out)):
+        return hidden
+    iz, ground = inverse_depth[start:stop], depth[start:stop]
+    for c in range(len(iz)):
         before = iz[c] > zero and one / iz[c] <= ground[c]
-        out[c] = before
+        hidden += np.int32(before)
         iz[c] = iz[c] if before else zero
+    return hidden
 
 
 @njit(cache=True, error_model="numpy")
-def _next_run(hidden, start):  # type: ignore[no-untyped-def]
-    """The next columns (first, last + 1) to colour; short hidden pieces are coloured too."""
-    width = len(hidden)
-    while start < width and hidden[start]:
-        start += 1
-    stop = seen = start
-    while seen < width and seen - stop < SHORT_RUN:
-        if not hidden[seen]:
+def _next_run(inverse_depth, start, first, last):  # type: ignore[no-untyped-def]
+    """The next columns (first, last + 1) to colour; short hidden pieces are coloured too.
+
+    Bodies are in the columns first..last - 1 alone.
+    """
+    width = len(inverse_depth)
+    if start >= first:
+        while start < last and inverse_depth[start] > 0.0:
+            start += 1
+        if start == width:
+            return width, width
+    stop = max(start, min(first, width))
+    seen = stop
+    while seen < last and seen - stop < SHORT_RUN:
+        if inverse_depth[seen] == 0.0:
             stop = seen + 1
         seen += 1
-    return start, width if stop == start else stop
+    return start, width if seen >= last and seen - stop < SHORT_RUN else stop
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)

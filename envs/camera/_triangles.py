@@ -524,7 +524,9 @@ def _fill(x0, y0, x1, y1, x2, y2, iz_u, iz_v, iz_0, number, inverse_depth, trian
         left, right = _columns(row, x0, y0, x1, y1, long_slope, upper, lower, width)
         base = iz_0 + iz_v * row
         if right - left > LONG_RUN:
-            drawn |= _fill_run(base, iz_u, left, number, inverse_depth[row, left:right], triangle_at[row, left:right])
+            drawn |= _fill_run(
+                base, iz_u, np.uint64(left), np.uint64(right), np.uint64(row), number, inverse_depth, triangle_at
+            )
             continue
         for column in range(left, right):
             iz = np.float32(base + iz_u * column)
@@ -535,16 +537,17 @@ def _fill(x0, y0, x1, y1, x2, y2, iz_u, iz_v, iz_0, number, inverse_depth, trian
     return drawn
 
 
-@njit(cache=True, error_model="numpy")
-def _fill_run(base, iz_u, left, number, inverse_depth, triangle_at):  # type: ignore[no-untyped-def]
-    """A long run of pixels from column `left`, without branches, so that it becomes vector code."""
+@njit(cache=True, error_model="numpy", inline="always")
+def _fill_run(base, iz_u, left, right, row, number, inverse_depth, triangle_at):  # type: ignore[no-untyped-def]
+    """A long run of a row's pixels: no branches and no indices that might be negative, so it becomes vector code."""
     drawn = np.int32(0)
     number = np.int32(number)
-    for c in range(len(inverse_depth)):
-        iz = np.float32(base + iz_u * (left + c))
-        closer = iz > inverse_depth[c]
-        inverse_depth[c] = iz if closer else inverse_depth[c]
-        triangle_at[c] = number if closer else triangle_at[c]
+    for column in range(left, right):
+        iz = np.float32(base + iz_u * np.int32(column))
+        before = inverse_depth[row, column]
+        closer = iz > before
+        inverse_depth[row, column] = iz if closer else before
+        triangle_at[row, column] = number if closer else triangle_at[row, column]
         drawn |= np.int32(closer)
     return drawn > 0
 
@@ -556,8 +559,8 @@ def _fill_mask(x0, y0, x1, y1, x2, y2, mask):  # type: ignore[no-untyped-def]
     x0, y0, x1, y1, long_slope, upper, lower, first, last = _edges(x0, y0, x1, y1, x2, y2, width, height)
     for row in range(first, last):
         left, right = _columns(row, x0, y0, x1, y1, long_slope, upper, lower, width)
-        for column in range(left, right):
-            mask[row, column] = 1
+        for column in range(np.uint64(left), np.uint64(right)):
+            mask[np.uint64(row), column] = 1
 
 
 @njit(cache=True, error_model="numpy")

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from ..worlds.bullet import connect, load_pybullet, silence
 from ..worlds.world import Array, Mesh, Snapshot
-from .raster import NOBODY, Frame, Rasterizer
+from .frame import Frame
+from .raster import NOBODY, Rasterizer
 
 TINY_SAMPLE_OFFSET = (0.0, 1.0)
 """Where TinyRenderer samples a pixel (right, down): its lower left corner, not its centre."""

@@ -12,7 +12,8 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from ..worlds.world import Array, Snapshot
-from .raster import Frame, Rasterizer
+from .frame import Frame
+from .raster import Rasterizer
 
 NOISE_TABLE = 1 << 15
 Range = tuple[float, float]

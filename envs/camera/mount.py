@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..worlds.world import Array, Snapshot
-from .raster import Frame
+from .frame import Frame
 
 
 @dataclass(frozen=True)
@@ -21,6 +21,7 @@ class Mount:
         pan_rad: how far it looks to the left of forward.
         horizontal_fov_rad: full horizontal field of view.
         rate_hz: pictures a second; None is one every step.
+        own_body: whether it sees the robot it sits on, which then is an object of its picture like any other.
 
     Raises:
         ValueError: a field of view outside (0, pi), a tilt beyond straight down or up, a rate that is not positive.
@@ -33,6 +34,7 @@ class Mount:
     pan_rad: float = 0.0
     horizontal_fov_rad: float = np.radians(70.0)
     rate_hz: float | None = None
+    own_body: bool = False
 
     def __post_init__(self) -> None:
         if not 0 < self.horizontal_fov_rad < np.pi:

@@ -27,6 +27,7 @@ from ._triangles import (
     draw_bodies,
     draw_shadows,
 )
+from .frame import Frame, FrameMemory
 from .shapes import PATTERNS, corner_normals, extent, normals, pattern_axes
 
 NEAR_M = 0.05
@@ -72,34 +73,6 @@ class Look:
 
 PLAIN = Look(smooth=False, patterns=False, shadows=False, contact=0.0, clouds=0.0)
 """Flat faces, ground and sky: the fastest."""
-
-
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """What one camera sees.
-
-    Attributes:
-        rgb: (H, W, 3) uint8.
-        depth: (H, W) float32, m along the optical axis; inf where there is only sky.
-        instances: (H, W) int32, index of the object in the snapshot; -1 for scenery, ground and sky.
-    """
-
-    rgb: NDArray[np.uint8]
-    depth: NDArray[np.float32]
-    instances: NDArray[np.int32]
-
-    @classmethod
-    def empty(cls, width: int, height: int) -> Frame:
-        """Arrays to render into, contents undefined."""
-        return cls(
-            np.empty((height, width, 3), np.uint8),
-            np.empty((height, width), np.float32),
-            np.empty((height, width), np.int32),
-        )
-
-    def copy(self) -> Frame:
-        """A frame that shares no memory with this one."""
-        return Frame(self.rgb.copy(), self.depth.copy(), self.instances.copy())
 
 
 class Rasterizer:
@@ -150,6 +123,7 @@ class Rasterizer:
         self._projected = np.empty((5, max(4, *(len(m.vertices) for m in meshes), 4)))
         self._triangles = np.empty((1024, TRIANGLE_FIELDS), np.float32)
         self._noise = _noise_tile().ravel()
+        self._frames = FrameMemory(self.width, self.height)
         self._light = Light()
         self._light_row = light_row(self._light, look.haze_m)
         self._fine: Rasterizer | None = None
@@ -219,7 +193,7 @@ class Rasterizer:
         out: Frame | None = None,
     ) -> Frame:
         """Like `render_view`, from the arrays of a snapshot."""
-        frame = Frame.empty(self.width, self.height) if out is None else self._checked(out)
+        frame = self._frames.frame() if out is None else self._checked(out)
         meshes = _contiguous(body_mesh, np.int64)
         poses = _contiguous(body_poses, np.float64)
         objects = _contiguous(body_object, np.int64)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,8 @@ import numpy as np
 from ..worlds.world import Array, Mesh, Snapshot
 from .backends import Camera, make_camera
 from .effects import EffectRanges, SensorCamera, SensorEffects
-from .raster import Frame, Look, Rasterizer
+from .frame import Frame
+from .raster import Look, Rasterizer
 
 BACKENDS = ("raster", "tiny", "egl")
 
@@ -34,6 +35,7 @@ class CameraRig:
         backend: "raster" (ours), "tiny" or "egl" (pybullet's).
         look: of our camera; None = `Look()`.
         effects: ranges from which every episode draws each camera's character; None = ideal cameras.
+        own_body: (N,) whose cameras see the robot they sit on; None = nobody's.
 
     Raises:
         ValueError: no such backend; a look or effects for a backend other than ours.
@@ -49,6 +51,7 @@ class CameraRig:
         backend: str = "raster",
         look: Look | None = None,
         effects: EffectRanges | None = None,
+        own_body: Sequence[bool] | None = None,
     ) -> None:
         if backend not in BACKENDS:
             raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
@@ -57,6 +60,7 @@ class CameraRig:
         self.intrinsics = intrinsics
         self._meshes, self._width, self._height = tuple(meshes), width, height
         self._backend, self._look, self._ranges = backend, look, effects
+        self._own_body = None if own_body is None or not any(own_body) else np.array(own_body)
         self._camera: Camera | None = None
         self._sensors: list[SensorCamera] = []
         self._sensors_of: tuple[SensorEffects, ...] = ()
@@ -70,6 +74,9 @@ class CameraRig:
     def shoot(self, snapshot: Snapshot, exposures: Exposures, robots: Sequence[int] | None = None) -> tuple[Frame, ...]:
         """A fresh frame of every robot's camera, or of those of `robots`."""
         camera = self._renderer()
+        if self._own_body is not None:
+            # A renderer leaves out the object that a robot is: to it, these are none.
+            snapshot = replace(snapshot, robot_object=np.where(self._own_body, -1, snapshot.robot_object))
         robots = range(len(self.intrinsics)) if robots is None else robots
         if not exposures.effects:
             return tuple(camera.render(snapshot, i, self.intrinsics[i]) for i in robots)

@@ -7,8 +7,9 @@ import pytest
 
 from covis.envs.camera import effects as fx
 from covis.envs.camera import shapes
+from covis.envs.camera.frame import Frame
 from covis.envs.camera.mount import Mount
-from covis.envs.camera.raster import Frame, Rasterizer, intrinsics_from_fov, look_at
+from covis.envs.camera.raster import Rasterizer, intrinsics_from_fov, look_at
 from covis.envs.worlds.world import Light, Snapshot
 
 WIDTH, HEIGHT = 120, 90

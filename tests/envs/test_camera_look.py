@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from covis.envs.camera import shapes
-from covis.envs.camera.raster import PLAIN, Frame, Look, Rasterizer, intrinsics_from_fov, look_at
+from covis.envs.camera.frame import Frame
+from covis.envs.camera.raster import PLAIN, Look, Rasterizer, intrinsics_from_fov, look_at
 from covis.envs.worlds.world import Light, Mesh, Snapshot
 
 K = intrinsics_from_fov(160, 120, np.radians(70))

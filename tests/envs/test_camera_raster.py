@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from covis.envs.camera import shapes
-from covis.envs.camera.raster import Frame, Rasterizer, intrinsics_from_fov, look_at
+from covis.envs.camera.frame import Frame
+from covis.envs.camera.raster import Rasterizer, intrinsics_from_fov, look_at
 from covis.envs.worlds.world import Light, Mesh, Snapshot
 
 FOV = np.radians(70)

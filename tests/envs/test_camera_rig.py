@@ -140,3 +140,21 @@ def test_a_robot_without_a_body_carries_no_mount():
     env = boxes(mounts=(Mount(), None))
     with pytest.raises(ValueError, match="robot 0 has no body"):
         env.reset(seed=0)
+
+
+def test_a_camera_sees_its_own_robot_only_if_mounted_so():
+    above = {"forward_m": -1.5, "height_m": 1.6, "tilt_rad": 0.6}
+    for backend in ("raster", "tiny"):
+        env = parallel_env(
+            "multi_robot",
+            preset="easy",
+            width=64,
+            height=48,
+            backend=backend,
+            mounts=(Mount(**above), Mount(**above, own_body=True)),
+        )
+        env.reset(seed=0)
+        truth, own = env.ground_truth(), env.snapshot().robot_object
+        assert truth.pixels[0, own[0]] == 0
+        assert truth.pixels[1, own[1]] > 50
+        env.close()
