@@ -10,17 +10,12 @@ from typing import Any, Literal
 import numpy as np
 
 from ..envs.claims import Claims
-from ..fusion.gains import fuse_own
-from ..fusion.groups import group_detections
 from ..fusion.objects import GAINS, Gain
+from ..fusion.team import fuse_team
 from ..matching import Matcher, Matching, RelativePose, load_matcher
-from ..matching.multiway import consistent
 from .perception.detections import Detections, Perceptor
 
 Matchings = dict[tuple[int, int], Matching]
-
-GATE = 0.999
-"""Share of honest differences between two robots' measurements that stays; the others are wrong matches."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,16 +99,18 @@ def relative_pose(source: View, target: View) -> RelativePose:
 
 def claims(views: Sequence[View], matchings: Matchings, max_detections: int, gain: Gain = "covariance") -> list[Claims]:
     """What every robot asserts: its boxes, its matches, its detections' positions alone and fused."""
-    graphs = [view.detections.graph for view in views]
-    poses = {(i, j): relative_pose(views[i], views[j]) for i, j in combinations(range(len(views)), 2)}
-    sizes = [len(g) for g in graphs]
-    groups = group_detections(sizes, consistent(matchings, sizes) if len(views) > 2 else matchings)
-    gate = None if gain == "paper" else GATE
+    team = fuse_team(
+        [view.detections.graph for view in views],
+        [view.T_world_camera for view in views],
+        [view.pose_covariance for view in views],
+        matchings,
+        gain=gain,
+    )
     out = []
-    for i, view in enumerate(views):
+    for i, (view, own) in enumerate(zip(views, team, strict=True)):
+        assert own is not None
         n = len(view.detections)
         claim = Claims.empty(max_detections, len(views) - 1)
-        own = fuse_own(graphs, poses, groups, i, gain=gain, gate=gate, frame_covariance=view.pose_covariance)
         claim.boxes[:n] = view.detections.boxes
         claim.positions[:n] = own.positions
         claim.positions_single[:n] = own.positions_single

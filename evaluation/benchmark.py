@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from .comparison import Entry, Ordering, compared, judged
 from .engine import Results, make_executor, run
-from .experiments import Experiment, target_name, units_of
+from .experiments import Experiment, absolute, target_name, units_of
 from .extras import require_scene
 from .methods import Method
 from .provenance import RENDERER, provenance
@@ -123,6 +123,8 @@ def run_experiments(
         }
         shards.open(request, session, resume=resume, overwrite=overwrite)
     noted = {"commit": session["commit"]}
+    if engine == "ray":  # elsewhere the working directory is another
+        units = [replace(unit, experiment=absolute(unit.experiment)) for unit in units]
     results = run(units, executor, shards=shards, shared_folder=engine == "local", about=noted, progress=progress)
     rows, verdicts = [], []
     for experiment in experiments:

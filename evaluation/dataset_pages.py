@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from ..matching.pose import Array, transform
+from .dataset_errors import Matched, Team
 from .datasets import Dataset, Frame, Stored, View, optional_column
 from .pictures import Page, Result, Sight, recompressed, rounded
-from .records import Record
 
 
-def page(name: str, frame: Frame, found: Sequence[tuple[Record, np.ndarray]]) -> Page:
-    """A frame of the target called `name`, without images.
-
-    `found` holds every record of the frame with its matched pairs (k, 2).
-    """
-    numbers = {view.robot: i for i, view in enumerate(frame.views)}
-    methods = dict.fromkeys(record.method for record, _ in found)
-    results = [_result(method, [f for f in found if f[0].method == method], numbers) for method in methods]
+def page(name: str, frame: Frame, found: Sequence[Matched], teams: Mapping[str, Team]) -> Page:
+    """A frame of the target called `name`, without images: all that was matched in it, and what fusion gave of it."""
+    methods = dict.fromkeys(m.record.method for m in found)
+    results = [
+        _result(method, [m for m in found if m.record.method == method], _places(frame, teams.get(method)))
+        for method in methods
+    ]
     return Page(name, frame.episode, frame.index, "episode", None, [_sight(v) for v in frame.views], results)
 
 
@@ -56,15 +55,26 @@ def _levelled(view: View) -> Array:
     return view.graph.positions @ np.stack([np.cross(ahead, up), ahead, up], axis=1)
 
 
-def _result(method: str, found: Sequence[tuple[Record, np.ndarray]], numbers: dict[str, int]) -> Result:
+def _result(method: str, found: Sequence[Matched], places: list[list[list[float]]]) -> Result:
     return Result(
         method=method,
-        robots=[[numbers[r.source], numbers[r.partner]] for r, pairs in found for _ in pairs],
-        pairs=[match for _, pairs in found for match in pairs.tolist()],
-        scores=[score for r, _ in found for score in r.scores],
-        hits=[hit for r, _ in found for hit in r.hits],
-        common=sum(r.common for r, _ in found),
+        robots=[[m.a, m.b] for m in found for _ in m.matching.pairs],
+        pairs=[match for m in found for match in m.matching.pairs.tolist()],
+        scores=[score for m in found for score in m.record.scores],
+        hits=[hit for m in found for hit in m.record.hits],
+        common=sum(m.record.common for m in found),
+        fused=places,
     )
+
+
+def _places(frame: Frame, team: Team | None) -> list[list[list[float]]]:
+    """Per view and detection the fused place in the world, by the true pose; nothing unless all views have one."""
+    places = []
+    for view, own in zip(frame.views, team or [None] * len(frame.views), strict=True):
+        if own is None or view.pose_truth is None:
+            return []
+        places.append(rounded(transform(view.pose_truth, own.positions)))
+    return places
 
 
 def with_images(dataset: Dataset, pages: Sequence[Page]) -> list[Page]:

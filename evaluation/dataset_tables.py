@@ -31,6 +31,7 @@ DETECTION_COLUMNS = (
     "attribute_variance",
 )
 OBJECT_COLUMNS = ("frame", "robot", "identity", "pixels")
+MAX_DETECTION = 2**31 - 1
 MAX_VALUE = 1e7
 """Metres, pixels or confidence: what lies beyond is a mistake of whoever wrote it, and would overflow when squared."""
 UNIT_TOLERANCE = 1e-2
@@ -168,7 +169,7 @@ def read_robots(file: Path) -> dict[str, Any]:
     return out
 
 
-def read_detections(file: Path, n_classes: int) -> dict[str, Any]:
+def read_detections(file: Path, n_classes: int, image_size: tuple[int, int] | None = None) -> dict[str, Any]:
     """detections.parquet, a column as an array each (None where absent)."""
     table = read_table(file, DETECTION_COLUMNS, ("truth", "covariance", "embedding", "box"))
     out: dict[str, Any] = {
@@ -186,14 +187,49 @@ def read_detections(file: Path, n_classes: int) -> dict[str, Any]:
         "box": _lists(table, "box", file, 4, nullable=True),
     }
     attribute, box, covariance = out["attribute"], out["box"], out["covariance"]
+    number = out["detection"]
+    _refuse(number > MAX_DETECTION, "detection", file, lambda row: f": {number[row]} is beyond {MAX_DETECTION}")
     negative = (attribute < 0).any(axis=1)
     _refuse(negative, "attribute", file, lambda row: f": negative confidence {attribute[row].min()}")
     if box is not None:
         wrong = (box[:, 2] < box[:, 0]) | (box[:, 3] < box[:, 1])
         _refuse(wrong, "box", file, lambda row: f": {box[row]} is not [u0, v0, u1, v1]")
+        _check_inside(box, image_size, file)
     if covariance is not None:
         _check_covariances(covariance.reshape(-1, 3, 3), file)
+    _check_identities(out, file)
     return out
+
+
+def _check_inside(box: Array, image_size: tuple[int, int] | None, file: Path) -> None:
+    """Boxes may reach over the image's edge, by the image's own size at most, but must show some of it."""
+    if image_size is None:
+        return
+    size = np.array(image_size)
+    outside: NDArray[np.bool_] = np.any(
+        (box[:, 2:] < 0) | (box[:, :2] > size) | (box[:, :2] < -size) | (box[:, 2:] > 2 * size), axis=1
+    )
+    what = f"lies outside the image of {size[0]}x{size[1]} pixels"
+    _refuse(outside, "box", file, lambda row: f": {box[row]} {what}")
+
+
+def _check_identities(detections: dict[str, Any], file: Path) -> None:
+    """A robot sees an object once in a frame: matches are counted per object."""
+    _, robot = np.unique(np.asarray(detections["robot"], dtype=object).astype(str), return_inverse=True)
+    rows = np.flatnonzero(detections["identity"] >= 0)
+    keys = np.stack([detections["frame"], robot, detections["identity"]], axis=1)[rows]
+    _, first, group = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    again = np.zeros(len(robot), dtype=np.bool_)
+    again[rows] = first[group.ravel()] != np.arange(len(rows))
+    _refuse(
+        again,
+        "identity",
+        file,
+        lambda row: (
+            f": frame {detections['frame'][row]}, robot {detections['robot'][row]!r} has object "
+            f"{detections['identity'][row]} twice (a second detection of an object has a negative identity)"
+        ),
+    )
 
 
 def read_objects(file: Path) -> dict[str, Any] | None:
@@ -235,7 +271,13 @@ def read_table(file: Path, required: tuple[str, ...], optional: tuple[str, ...])
 
 def _columns(file: Path, names: list[str]) -> pa.Table:
     # One file, not a data set of files: partitions must not be guessed from the names of its folders.
-    return pq.ParquetFile(file, page_checksum_verification=True).read(names)
+    table = pq.ParquetFile(file, page_checksum_verification=True).read(names)
+    return pa.table({field.name: _decoded(table.column(field.name)) for field in table.schema})
+
+
+def _decoded(column: pa.ChunkedArray) -> pa.ChunkedArray:
+    """Without dictionary encoding, as pandas' categories have it."""
+    return column.cast(column.type.value_type) if pa.types.is_dictionary(column.type) else column
 
 
 def _readable(file: Path, name: str) -> bool:
@@ -282,7 +324,7 @@ def _integers(table: pa.Table, name: str, file: Path, least: int | None = None) 
     values = _numbers(table, name, file)
     with np.errstate(invalid="ignore"):
         out = values.astype(np.int64)
-    _refuse(out != values, name, file, lambda row: f": {values[row]} is not a whole number")
+    _refuse(out != values, name, file, lambda row: f": {values[row]} is not a whole number of 64 bits")
     if least is not None:
         _refuse(out < least, name, file, lambda row: f": {out[row]} is less than {least}")
     return out

@@ -34,9 +34,9 @@ class View:
         robot: its name.
         graph: its detections, shuffled.
         identity: (n,) int64 true object of each detection; negative = not a true object.
-        truth: (n, 3) m true world position of each detection, or None.
+        truth: (n, 3) m true world position of each detection, NaN where unknown; or None.
         pose: (4, 4) noisy T_world_sensor with `pose_covariance` (6, 6), or None.
-        pose_truth: (4, 4), or None.
+        pose_truth: (4, 4), or None. Where a dataset names no error of its poses, they are the truth.
         odometry: (4, 4) noisy own motion since this robot's previous frame, or None.
         order: (n,) row of each detection as stored, within this robot and frame.
         boxes: (n, 4) px [u0, v0, u1, v1] of each detection, or None.
@@ -130,12 +130,16 @@ class Dataset:
         robot, frame = str(robots["robot"][row]), int(robots["frame"][row])
         stored = self._detection_rows.get((frame, robot), np.zeros(0, dtype=np.int64))
         stream = np.random.default_rng([self.seed, frame, zlib.crc32(robot.encode())])
-        order = stream.permutation(len(stored))
+        # Shuffled from the order of their numbers, so that nothing depends on the order of rows.
+        order = np.argsort(detections["detection"][stored])[stream.permutation(len(stored))]
         at = stored[order]
         pose = _row(robots["pose"], row, (4, 4))
         own_up = _row(robots["up"], row, (3,))
         up = meta["up"] if own_up is None else own_up
         intrinsics = _row(robots["intrinsics"], row, (3, 3))
+        pose_truth = _row(robots["pose_truth"], row, (4, 4))
+        if pose_truth is None and meta["pose_std"] is None:
+            pose_truth = pose
         graph = ObjectGraph(
             positions=detections["position"][at],
             attributes=detections["attribute"][at],
@@ -153,10 +157,10 @@ class Dataset:
             robot=robot,
             graph=graph,
             identity=detections["identity"][at],
-            truth=_rows(detections["truth"], at, (3,)),
+            truth=None if detections["truth"] is None else detections["truth"][at],
             pose=pose,
             pose_covariance=None if pose is None else pose_covariance(meta["pose_std"], up),
-            pose_truth=_row(robots["pose_truth"], row, (4, 4)),
+            pose_truth=pose_truth,
             odometry=_row(robots["odometry"], row, (4, 4)),
             order=order,
             boxes=_rows(detections["box"], at, (4,)),
@@ -194,7 +198,7 @@ def load_dataset(path: str | Path, seed: int = 0) -> Dataset:
         raise DatasetError(f"{path} is not a folder")
     meta = read_meta(path / "dataset.json")
     robots = read_robots(path / "robots.parquet")
-    detections = read_detections(path / "detections.parquet", len(meta["classes"]))
+    detections = read_detections(path / "detections.parquet", len(meta["classes"]), meta["image_size"])
     objects = read_objects(path / "objects.parquet")
 
     robot_rows = _group_robots(robots, path / "robots.parquet")

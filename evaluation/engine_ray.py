@@ -2,7 +2,7 @@
 
 A unit is one task, so that Ray places, spreads and, when a worker or a node dies, repeats it elsewhere. What a unit
 yields comes back through Ray and is written by the driver: nodes need not share a file system. They need the same
-covis and the same versions of what can alter results, and dataset folders under the same paths.
+covis and the same versions of what can alter results, and dataset folders under the same (absolute) paths.
 """
 
 from __future__ import annotations
@@ -13,9 +13,11 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache, partial
+from pathlib import Path
 from typing import Any
 
-from .engine import Executor, Failure, Outcome, RunOneUnit, WorkerDiedError
+from .engine import Executor, Failure, Outcome, RunOne, RunOneUnit, WorkerDiedError
+from .experiments import Unit
 from .extras import require
 from .provenance import PACKAGES, versions
 
@@ -131,7 +133,18 @@ def _run_there(run_one: RunOneUnit, number: int, expected: dict[str, str]) -> Ou
             if here.get(name) != expected.get(name)
         ]
         raise RuntimeError(f"node {os.uname().nodename} would give other results: it has {', '.join(differing)}")
+    if isinstance(run_one, RunOne):
+        _need_files(run_one.units[number])
     return run_one(number)
+
+
+def _need_files(unit: Unit) -> None:
+    """Raises RuntimeError where this node lacks the dataset folder of a unit."""
+    target = unit.experiment.target
+    if unit.experiment.kind == "dataset" and not Path(target).is_dir():
+        raise RuntimeError(
+            f"node {os.uname().nodename} has no dataset folder {target}: put it there under the same path on every node"
+        )
 
 
 @lru_cache(maxsize=1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from pathlib import Path
 from typing import Literal
 
 from . import synthetic
@@ -127,6 +128,15 @@ def target_name(experiment: Experiment) -> str:
     return f"synthetic-{experiment.target}" if experiment.kind == "synthetic" else experiment.target
 
 
+def absolute(experiment: Experiment) -> Experiment:
+    """The same, with the whole path of its dataset folder."""
+    return (
+        replace(experiment, target=str(Path(experiment.target).resolve()))
+        if experiment.kind == "dataset"
+        else experiment
+    )
+
+
 def _chunks(experiment: Experiment) -> list[tuple[int, ...]]:
     if experiment.kind == "dataset":
         return _by_frames(dataset(experiment.target, experiment.seeds[0]), experiment.settings.episodes)
@@ -150,6 +160,12 @@ def _by_frames(data: Dataset, limit: int | None) -> list[tuple[int, ...]]:
     return [*chunks, tuple(chunk)] if chunk else chunks
 
 
-@lru_cache(maxsize=4)
 def dataset(path: str, seed: int) -> Dataset:
+    """The dataset folder, read once as long as its files stay as they are."""
+    files = [file.stat() for file in sorted(Path(path).glob("*")) if file.suffix in (".json", ".parquet")]
+    return _read(path, seed, tuple((s.st_ino, s.st_mtime_ns, s.st_size) for s in files))
+
+
+@lru_cache(maxsize=4)
+def _read(path: str, seed: int, state: tuple[tuple[int, int, int], ...]) -> Dataset:
     return load_dataset(path, seed)

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..fusion.gains import fuse
-from ..fusion.groups import Groups, group_detections
+from ..fusion.groups import group_detections
 from ..fusion.metrics import displacement_errors
-from ..fusion.objects import FusedObjects, own_objects
+from ..fusion.objects import FusedObjects
+from ..fusion.team import GATE, fuse_team
 from ..matching import Matching, ObjectGraph, RelativePose
 from ..matching.metrics import Counts, count, is_correct
 from ..matching.pose import Array, invert, transform
@@ -278,16 +279,14 @@ def judge(sightings: Sequence[Sighting], matchings: Matchings) -> Result:
         if (prior := _relative(sightings[i], sightings[j])) is not None
     }
     first = next((i for i, s in enumerate(sightings) if s.pose is not None), None)
-    fused = None if first is None else fuse(graphs, poses, groups, frame=first)
-    return Result(matchings, hits, fused, _figures(sightings, matchings, hits, groups, poses))
+    fused = None if first is None else fuse(graphs, poses, groups, frame=first, gate=GATE)
+    return Result(matchings, hits, fused, _figures(sightings, matchings, hits))
 
 
 def _figures(
     sightings: Sequence[Sighting],
     matchings: Matchings,
     hits: Mapping[tuple[int, int], NDArray[np.bool_]],
-    groups: Groups,
-    poses: Mapping[tuple[int, int], RelativePose],
 ) -> dict[str, float]:
     """Precision and recall over all pairs of robots; displacement errors over rightly matched detections."""
     out: dict[str, float] = {}
@@ -298,13 +297,15 @@ def _figures(
         out["precision"] = counts.precision
     if counts.common:
         out["recall"] = counts.recall
-    graphs = [s.graph for s in sightings]
+    team = fuse_team(
+        [s.graph for s in sightings], [s.pose for s in sightings], [s.pose_covariance for s in sightings], matchings
+    )
     single, merged = [], []
-    for i, sighting in enumerate(sightings):
-        right = _rightly_matched(i, matchings, hits)
-        if not len(right) or sighting.truth is None or sighting.pose_truth is None or sighting.pose is None:
+    for i, (sighting, own) in enumerate(zip(sightings, team, strict=True)):
+        if own is None or sighting.truth is None or sighting.pose_truth is None:
             continue
-        own = own_objects(graphs, fuse(graphs, poses, groups, frame=i))
+        right = _rightly_matched(i, matchings, hits)
+        right = right[np.isfinite(sighting.truth[right]).all(axis=1)]
         true = transform(invert(sighting.pose_truth), sighting.truth[right])
         single += displacement_errors(own.positions_single[right], true).tolist()
         merged += displacement_errors(own.positions[right], true).tolist()

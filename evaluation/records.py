@@ -32,6 +32,7 @@ SCHEMA = pa.schema(
         ("match_ms", pa.float64()),
         ("scores", pa.list_(pa.float64())),
         ("hits", pa.list_(pa.bool_())),
+        ("positions_scored", pa.bool_()),
         ("error_single_m", pa.list_(pa.float64())),
         ("error_fused_m", pa.list_(pa.float64())),
         ("error_range_m", pa.list_(pa.float64())),
@@ -48,10 +49,10 @@ class Record:
     """One pair of views matched by one method.
 
     `experiment` and `seed` say of which part of a run; `visible` counts objects that both cameras could see (None on
-    datasets, which do not know); `scores` and `hits` run over the emitted matches; the errors (m) over objects both
-    localised, where positions are scored, each with the object's distance from the robot that errs and how much of it
-    is hidden there (0 to 1). `common_...` runs over the objects both detected: the larger distance, the larger
-    occlusion, and whether they were matched rightly; the occlusion is empty on datasets, which do not know it.
+    datasets that do not know); `scores` and `hits` run over the emitted matches; the errors (m) over objects both
+    localised, where `positions_scored`, each with the object's distance from the robot that errs and how much of it is
+    hidden there (0 to 1; empty on datasets, which do not know). `common_...` runs over the objects both detected: the
+    larger distance, the larger occlusion (empty on datasets), and whether they were matched rightly.
     """
 
     target: str
@@ -67,6 +68,7 @@ class Record:
     scores: list[float] = field(default_factory=list)
     hits: list[bool] = field(default_factory=list)
     visible: int | None = None
+    positions_scored: bool = False
     error_single_m: list[float] = field(default_factory=list)
     error_fused_m: list[float] = field(default_factory=list)
     error_range_m: list[float] = field(default_factory=list)
@@ -115,6 +117,7 @@ class Tally:
         match_ms: (pairs,).
         scores, hits: of all emitted matches.
         visible: objects that both cameras could see; None where no record knows.
+        positions_scored: whether any record's positions are scored.
         errors_m: sums of displacement errors of one robot alone and fused; `n_errors` is their number.
     """
 
@@ -125,6 +128,7 @@ class Tally:
     scores: NDArray[np.float64]
     hits: NDArray[np.bool_]
     visible: int | None
+    positions_scored: bool
     errors_m: tuple[float, float]
     n_errors: int
 
@@ -146,6 +150,7 @@ class Tally:
             scores=_flat(table, "scores"),
             hits=_flat(table, "hits").astype(bool),
             visible=int(visible.to_numpy().sum()) if len(visible) else None,
+            positions_scored=bool(table["positions_scored"].to_numpy().any()),
             errors_m=(float(single.sum()), float(fused.sum())),
             n_errors=len(single),
         )
@@ -166,6 +171,7 @@ class Tally:
             scores=np.concatenate([np.zeros(0), *(t.scores for t in tallies)]),
             hits=np.concatenate([np.zeros(0, dtype=bool), *(t.hits for t in tallies)]),
             visible=sum(visible) if visible else None,
+            positions_scored=any(t.positions_scored for t in tallies),
             errors_m=(sum(t.errors_m[0] for t in tallies), sum(t.errors_m[1] for t in tallies)),
             n_errors=sum(t.n_errors for t in tallies),
         )
@@ -191,10 +197,10 @@ class Tally:
             "n_covisible": common,
         }
         if self.visible is not None:
+            row |= {"n_visible": self.visible, "scene_recall": correct / self.visible if self.visible else 0.0}
+        if self.positions_scored:
             single, fused = self.errors_m
             row |= {
-                "n_visible": self.visible,
-                "scene_recall": correct / self.visible if self.visible else 0.0,
                 "displacement_single_m": single / self.n_errors if self.n_errors else None,
                 "displacement_fused_m": fused / self.n_errors if self.n_errors else None,
             }

@@ -8,10 +8,10 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..matching import Matching
 from ..matching.metrics import Counts, is_correct
+from .dataset_errors import Matched, fused, with_errors
 from .dataset_pages import page
 from .datasets import Dataset, Frame, View, prior_between
 from .matching_run import match_pair
@@ -48,18 +48,21 @@ def run_frames(
         if trackers is not None:
             odometry = {view.robot: view.odometry for view in frame.views}
             trackers.begin(frame.episode, odometry, {view.robot: view.graph for view in frame.views})
-        found: list[tuple[Record, NDArray[np.int64]]] = []
+        found, scored = [], []
         for pair in pairs(frame, 0 if trackers is not None else settings.min_common):
             matched = list(_match_all(name, pair, methods, settings, trackers))
+            found += matched
             # A tracker sees every frame; which of them are scored is another matter.
             if n_common(pair[1], pair[2]) >= settings.min_common:
-                found += matched
-        records += [record for record, _ in found]
-        if book is not None and found:
+                scored += matched
+        teams = fused(frame, found)
+        scored = with_errors(frame, scored, teams)
+        records += [m.record for m in scored]
+        if book is not None and scored:
             counts: dict[str, Counts] = {}
-            for record, _ in found:
-                counts[record.method] = counts.get(record.method, Counts()) + record.counts
-            book.see(frame.episode, counts, partial(page, name, frame, found))
+            for m in scored:
+                counts[m.record.method] = counts.get(m.record.method, Counts()) + m.record.counts
+            book.see(frame.episode, counts, partial(page, name, frame, scored, teams))
     return records
 
 
@@ -83,12 +86,13 @@ def _match_all(
     methods: Sequence[Method],
     settings: Settings,
     trackers: PairTrackers | None,
-) -> Iterator[tuple[Record, NDArray[np.int64]]]:
-    """The record of each method, and its matched pairs (k, 2)."""
+) -> Iterator[Matched]:
+    """What each method makes of a pair of views."""
     frame, source, target = pair
     prior = prior_between(source, target) if settings.pose == "known" else None
     where = f"{name}, frame {frame.index}, {source.robot} and {target.robot}"
-    number = frame.views.index(source) * len(frame.views) + frame.views.index(target)
+    a, b = frame.views.index(source), frame.views.index(target)
+    number = a * len(frame.views) + b
     for method in methods:
         matching, elapsed = match_pair(
             method,
@@ -115,7 +119,7 @@ def _match_all(
             visible=_n_visible(source, target),
             **_common(source, target, matching),
         )
-        yield record, matching.pairs
+        yield Matched(a, b, matching, record)
 
 
 def _common(source: View, target: View, matching: Matching) -> dict[str, list[Any]]:

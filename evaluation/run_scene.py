@@ -189,6 +189,7 @@ def records(scene: str, frame: SceneFrame, method: Method) -> Iterator[Record]:
             match_ms=frame.match_ms[method.label][pair.a, pair.b],
             scores=pair.scores.tolist(),
             hits=pair.hits.tolist(),
+            positions_scored=True,
             error_single_m=[float(result.error_single[slot]) for slot in slots],
             error_fused_m=[float(result.error_fused[slot]) for slot in slots],
             error_range_m=[float(distance[robot, result.tied[robot, k]]) for robot, k in slots],

@@ -13,6 +13,7 @@ from .objects import FusedObjects, OwnObjects, agreement, own_objects, relative_
 from .refine import Refined, refine
 from .registration import RegistrationError, register
 from .sequence import PairOptions, PairTracker
+from .team import fuse_team
 from .tracking import Batch, Tracker, TrackerOptions
 
 __all__ = [
@@ -42,6 +43,7 @@ __all__ = [
     "fuse_gaussians",
     "fuse_isotropic",
     "fuse_own",
+    "fuse_team",
     "fused_variance",
     "fusion_gains",
     "group_detections",

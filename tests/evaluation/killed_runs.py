@@ -1,9 +1,9 @@
 """Runs to be killed: a process that has everything loaded, and forks one child per job read from standard input.
 
-Called with the kind of the runs (`record`, `benchmark` or `train`) and a folder for a first run, made here to warm up.
-A job is one line of JSON: `{"out": folder, "kill_after": seconds, "die_at": number}`. After so many seconds the child
+Called with the kind of the runs (one of `JOBS`) and a folder for a first run, made here to warm up. A job is one line
+of JSON: `{"out": folder, "workers": number, "kill_after": seconds, "die_at": number}`. After so many seconds the child
 is killed, unless it is done; and it kills itself at the rename of a file with that number, odd ones before it and even
-ones after. The answer is a line: exit status, renames made, seconds.
+ones after. The answer is a line: exit status, renames made, seconds. `workers` is for recordings and benchmarks.
 """
 
 import json
@@ -22,16 +22,17 @@ from covis.evaluation.settings import Settings
 experiments.FRAMES_PER_UNIT = 3
 
 
-def record_job(out: Path) -> None:
-    record("box_world:BoxWorld", Settings(episodes=3, perception="simulated"), out, resume=True)
+def record_job(out: Path, workers: int) -> None:
+    record("box_world:BoxWorld", Settings(episodes=3, perception="simulated"), out, workers=workers, resume=True)
 
 
-def benchmark_job(out: Path) -> None:
+def benchmark_job(out: Path, workers: int) -> None:
     methods = [Method.parse(text) for text in ("rgm", "bayes", "random")]
-    benchmark([str(out.parent / "data")], methods, Settings(), out=out, resume=True)
+    benchmark([str(out.parent / "data")], methods, Settings(), out=out, workers=workers, resume=True)
 
 
-def train_job(out: Path) -> None:
+def perception_job(out: Path, workers: int) -> None:
+    """Two processes that learn side by side, whatever `workers` says: their number is part of what is trained."""
     from covis.agents.perception.frames import Variant, joint_classes
     from covis.agents.perception.network import NetworkParams
     from covis.agents.perception.training import train
@@ -44,6 +45,8 @@ def train_job(out: Path) -> None:
     params = TrainingParams(
         minutes=None,
         steps=6,
+        workers=2,
+        meet_every=2,
         pairs=1,
         pool_chunks=1,
         steps_per_chunk=3,
@@ -53,7 +56,19 @@ def train_job(out: Path) -> None:
     finish(train(params, out, resume=True, network=network), params, out, 0)
 
 
-JOBS = {"record": record_job, "benchmark": benchmark_job, "train": train_job}
+def policy_job(out: Path, workers: int) -> None:
+    from covis.evaluation.policy_training import PolicyParams, train_policy
+
+    small = (("width", 64), ("height", 48), ("min_pixels", 10), ("max_cycles", 4))
+    train_policy(PolicyParams("multi_robot", "easy", steps=4 * 64, seed=1, options=small), out, resume=True)
+
+
+JOBS = {
+    "record": record_job,
+    "benchmark": benchmark_job,
+    "train perception": perception_job,
+    "train policy": policy_job,
+}
 
 
 def count_renames(die_at: int, counter: Path) -> None:
@@ -74,7 +89,7 @@ def count_renames(die_at: int, counter: Path) -> None:
 
 
 def serve(what: str, warm: str) -> None:
-    JOBS[what](Path(warm))
+    JOBS[what](Path(warm), 1)
     print("ready", flush=True)
     for line in sys.stdin:
         job = json.loads(line)
@@ -84,7 +99,7 @@ def serve(what: str, warm: str) -> None:
         child = os.fork()
         if child == 0:
             count_renames(job.get("die_at", 0), counter)
-            JOBS[what](out)
+            JOBS[what](out, job.get("workers", 1))
             os._exit(0)
         start = time.monotonic()
         status = wait(child, start + job.get("kill_after", 1e9))
@@ -103,7 +118,7 @@ def wait(child: int, deadline: float) -> int:
 
 
 if __name__ == "__main__":
-    if sys.argv[1] == "train":
+    if sys.argv[1].startswith("train"):
         import torch
 
         torch.set_num_threads(1)

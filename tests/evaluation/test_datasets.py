@@ -157,6 +157,13 @@ def test_unknown_columns_are_ignored(small_dataset):
         ("detections.parquet", edit(frame=99), "row 0 is of frame 99, robot 'robot_0', which robots.parquet lacks"),
         ("detections.parquet", edit(frame=-1), "column 'frame', row 0: -1 is less than 0"),
         ("detections.parquet", edit(detection=-1), "column 'detection', row 0: -1 is less than 0"),
+        ("detections.parquet", edit(detection=2**31), "column 'detection', row 0: 2147483648 is beyond"),
+        (
+            "detections.parquet",
+            lambda rows: [*rows[:1], rows[1] | {"identity": rows[0]["identity"]}, *rows[2:]],
+            "column 'identity', row 1: frame 0, robot 'robot_0' has object .* twice",
+        ),
+        ("detections.parquet", edit(identity=2.0**63), "column 'identity', row 0: .* is not a whole number of 64 bits"),
         ("detections.parquet", edit(detection=1), "row 1 repeats frame 0, robot 'robot_0', detection 1"),
         (
             "detections.parquet",
@@ -199,6 +206,19 @@ def test_bad_tables_name_file_column_and_row(small_dataset, file, change, messag
         with pytest.raises(DatasetError, match=message) as caught:
             read(small_dataset)
         assert str(small_dataset / file) in str(caught.value)
+
+
+def test_boxes_outside_the_image_are_refused(small_dataset):
+    head = json.loads((small_dataset / "dataset.json").read_text()) | {"image_size": [320, 240]}
+    (small_dataset / "dataset.json").write_text(json.dumps(head))
+    rewrite(small_dataset, "detections.parquet", each(box=[1.0, 1.0, 9.0, 9.0]))
+    for box in ([-60, 0, -20, 40], [0, 250, 10, 260], [0, 0, 5000, 40], [-900, 0, 20, 40]):
+        rewrite(small_dataset, "detections.parquet", each(of={3}, box=[float(x) for x in box]))
+        for read in (load_dataset, check):
+            with pytest.raises(DatasetError, match=r"'box', row 3: .* lies outside the image of 320x240 pixels"):
+                read(small_dataset)
+    rewrite(small_dataset, "detections.parquet", each(of={3}, box=[-5.0, 0.0, 330.0, 240.0]))
+    load_dataset(small_dataset)
 
 
 def test_bad_true_objects_are_refused_too(small_dataset):

@@ -1,10 +1,13 @@
 """Units on a Ray cluster of two nodes: the same results, bit for bit, when a worker and a node are lost half way."""
 
+from dataclasses import replace
+
 import pyarrow.parquet as pq
 import pytest
 
 from covis.evaluation import engine_ray, experiments, extras
 from covis.evaluation.benchmark import benchmark
+from covis.evaluation.engine import Done, RunOne
 from covis.evaluation.extras import MissingExtraError
 from covis.evaluation.methods import Method
 from covis.evaluation.settings import Settings
@@ -109,6 +112,17 @@ def test_a_lost_worker_and_a_lost_node_change_nothing(cluster, data, tmp_path, m
 def test_nodes_with_other_versions_are_refused():
     with pytest.raises(RuntimeError, match=r"would give other results: it has numpy .* instead of 1\.0"):
         engine_ray._run_there(lambda number: pytest.fail("ran"), 0, engine_ray._versions() | {"numpy": "1.0"})
+
+
+def test_a_node_without_the_dataset_is_named(data, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    here = experiments.Experiment("data", "dataset", "data", ("reid",), Settings(), (0,))
+    units = tuple(replace(unit, experiment=experiments.absolute(here)) for unit in experiments.units_of([here]))
+    assert isinstance(engine_ray._run_there(RunOne(units), 1, engine_ray._versions()), Done)
+    (tmp_path / "data").rename(tmp_path / "elsewhere")
+    message = rf"node .* has no dataset folder {tmp_path}/data: put it there under the same path on every node"
+    with pytest.raises(RuntimeError, match=message):
+        engine_ray._run_there(RunOne(units), 1, engine_ray._versions())
 
 
 def test_without_ray_the_extra_is_named(monkeypatch):

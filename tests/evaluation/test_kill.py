@@ -1,7 +1,8 @@
 """Kill -9 at any moment: a rerun that resumes ends with the results of an undisturbed run.
 
 Half of the kill points are moments drawn at random, half are the renames by which files appear, where a run is most
-vulnerable. All are real SIGKILLs.
+vulnerable. All are real SIGKILLs. Some of the recordings and benchmarks, and all trainings of eyes, are of two
+processes.
 """
 
 import importlib.util
@@ -20,8 +21,9 @@ import pytest
 from covis.evaluation.dataset_check import check
 
 pytestmark = pytest.mark.slow
-KILLS = 8
+KILLS = 7
 """Of each kind of run."""
+STARTING_S = 4.0
 
 
 class Runs:
@@ -66,7 +68,7 @@ def benchmarked(out):
     return [{k: v for k, v in row.items() if k != "match_ms"} for row in rows], records
 
 
-def trained(out):
+def trained_eyes(out):
     """The weights as they ship, and everything that a further training would go on from."""
     import torch
 
@@ -80,6 +82,14 @@ def trained(out):
     return (out / "eyes.safetensors").read_bytes(), plain(state)
 
 
+def trained_policy(out):
+    """The policy's weights, and the log of its training."""
+    from stable_baselines3 import PPO
+
+    weights = PPO.load(out / "policy.zip", device="cpu").policy.state_dict()
+    return plain(weights), json.loads((out / "log.json").read_text())
+
+
 def plain(value):
     """Tensors as arrays of bytes, so that they compare."""
     if isinstance(value, dict):
@@ -89,13 +99,22 @@ def plain(value):
     return np.asarray(value).tobytes() if hasattr(value, "detach") else value
 
 
-RESULTS = {"record": recorded, "benchmark": benchmarked, "train": trained}
+RESULTS = {
+    "record": recorded,
+    "benchmark": benchmarked,
+    "train perception": trained_eyes,
+    "train policy": trained_policy,
+}
+NEEDS = {
+    "train perception": ("torch", "safetensors", "pybullet"),
+    "train policy": ("stable_baselines3", "supersuit", "pybullet"),
+}
 
 
 @pytest.mark.parametrize("what", RESULTS)
 def test_killed_runs_resume_to_the_same_results(what, tmp_path, dataset_writer, request):
-    if what == "train" and not all(map(importlib.util.find_spec, ("torch", "safetensors", "pybullet"))):
-        pytest.skip("training needs covis[learned,envs]")
+    if not all(map(importlib.util.find_spec, NEEDS.get(what, ()))):
+        pytest.skip(f"needs {', '.join(NEEDS[what])}")
     dataset_writer(tmp_path / "data", n_frames=36)
     runs = Runs(what, str(tmp_path / "warm"))
     request.addfinalizer(runs.close)
@@ -109,7 +128,7 @@ def test_killed_runs_resume_to_the_same_results(what, tmp_path, dataset_writer, 
     kills = trial = 0
     while kills < KILLS:
         assert trial < 5 * KILLS, "most runs were over before they were killed"
-        plan = plans[trial] if trial < len(plans) else random_moments(rng, seconds, renames)
+        plan = plans[trial] if trial < len(plans) else random_moments(rng, seconds, renames, "train" in what)
         trial += 1
         out = tmp_path / f"killed-{trial}"
         for moment in plan:
@@ -121,9 +140,14 @@ def test_killed_runs_resume_to_the_same_results(what, tmp_path, dataset_writer, 
     print(f"{what}: {kills} kills in {trial} runs, each of {seconds:.1f} s and {renames} renames")
 
 
-def random_moments(rng, seconds, renames):
-    """When to kill one run, up to three times."""
-    return [
-        {"kill_after": rng.uniform(0, seconds)} if rng.random() < 0.5 else {"die_at": rng.randint(1, 2 * renames)}
-        for _ in range(rng.randint(1, 3))
-    ]
+def random_moments(rng, seconds, renames, alone):
+    """When to kill one run, up to three times; unless it runs `alone`, some of the times with two workers."""
+    moments = []
+    for _ in range(rng.randint(1, 3)):
+        if rng.random() < 0.5:
+            moments.append({"die_at": rng.randint(1, 2 * renames)})
+        elif alone or rng.random() < 0.5:
+            moments.append({"kill_after": rng.uniform(0, seconds)})
+        else:  # which take their time to start
+            moments.append({"kill_after": rng.uniform(0, seconds + STARTING_S), "workers": 2})
+    return moments

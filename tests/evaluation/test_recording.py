@@ -58,6 +58,10 @@ def test_it_scores_as_the_live_scene_does(recorded, pose):
     same = ("frames", "pairs", "n_correct", "n_retrieved", "n_covisible", "n_visible", "f1", "scene_recall")
     for a, b in zip(live, offline, strict=True):
         assert [a[key] for key in same] == [b[key] for key in same]
+        # Actions and observations are float32.
+        for key in ("displacement_single_m", "displacement_fused_m"):
+            assert a[key] == pytest.approx(b[key], rel=1e-3), key
+    assert any(row["displacement_fused_m"] < row["displacement_single_m"] for row in offline)
 
 
 def test_learned_eyes_record_all_that_matchers_saw(tmp_path):
@@ -74,6 +78,8 @@ def test_learned_eyes_record_all_that_matchers_saw(tmp_path):
         assert a["pairs"] > 0
         for key in ("pairs", "n_correct", "n_retrieved"):
             assert a[key] == b[key], key
+        for key in ("displacement_single_m", "displacement_fused_m"):
+            assert a[key] == pytest.approx(b[key], rel=1e-3), key
 
 
 def test_masks_and_boxes_are_of_what_the_image_shows(recorded):

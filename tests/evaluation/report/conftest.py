@@ -46,6 +46,7 @@ def make_record(target: str, method: str, episode: int, frame: int, rng: np.rand
         match_ms=float(rng.uniform(0.5, 2)),
         scores=scores.tolist(),
         hits=hits.tolist(),
+        positions_scored=True,
         error_single_m=rng.uniform(0.2, 0.4, n).tolist(),
         error_fused_m=rng.uniform(0.1, 0.3, n).tolist(),
         error_range_m=rng.uniform(2, 20, n).tolist(),
