@@ -47,6 +47,7 @@ def adapter(name: str) -> Matcher:
 
 
 def is_adapter(name: str) -> bool:
+    """Whether the name belongs to another package's matcher."""
     return name == "kiss-matcher" or name.startswith("pygm:")
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .checks import check_covariances, finite, for_each, numbers, pixels, unit_vector, variances
 from .pose import Array, RelativePose, check_pose, transform
 
 DEFAULT_BEARING_STD_RAD = 0.007
@@ -51,40 +52,40 @@ class ObjectGraph:
 
     def __post_init__(self) -> None:
         put = object.__setattr__
-        positions = _finite(self.positions, "positions")
+        positions = finite(self.positions, "positions")
         if positions.ndim != 2 or positions.shape[1] != 3:
             raise ValueError(f"positions must have shape (n, 3), got {positions.shape}")
         n = len(positions)
         put(self, "positions", positions)
-        attributes = _finite(self.attributes, "attributes")
+        attributes = finite(self.attributes, "attributes")
         if attributes.ndim != 2 or len(attributes) != n or attributes.shape[1] < 1:
             raise ValueError(f"attributes must have shape ({n}, c) with c >= 1, got {attributes.shape}")
         if (attributes < 0).any():
             raise ValueError(f"attributes must be non-negative, got {attributes.min():.3g}")
         put(self, "attributes", attributes)
         for name in ("position_variance", "attribute_variance"):
-            put(self, name, _variance(getattr(self, name), name, n))
+            put(self, name, variances(getattr(self, name), name, n))
         if self.covariances is not None:
-            covariances = _finite(self.covariances, "covariances")
-            _check_covariances(covariances, n)
+            covariances = finite(self.covariances, "covariances")
+            check_covariances(covariances, n)
             put(self, "covariances", covariances)
         for name in ("up", "forward"):
             if getattr(self, name) is not None:
-                put(self, name, _unit(getattr(self, name), name))
+                put(self, name, unit_vector(getattr(self, name), name))
         if self.embedding is not None:
-            embedding = _finite(self.embedding, "embedding")
+            embedding = finite(self.embedding, "embedding")
             if embedding.ndim != 2 or len(embedding) != n:
                 raise ValueError(f"embedding must have shape ({n}, e), got {embedding.shape}")
             put(self, "embedding", embedding)
         if self.intrinsics is not None:
-            K = _finite(self.intrinsics, "intrinsics")
+            K = finite(self.intrinsics, "intrinsics")
             if K.shape != (3, 3) or K[0, 0] <= 0 or K[1, 1] <= 0:
                 raise ValueError(f"intrinsics must be (3, 3) with positive focal lengths, got\n{K}")
             put(self, "intrinsics", K)
         if self.image_size is not None:
-            put(self, "image_size", _pixels(self.image_size))
+            put(self, "image_size", pixels(self.image_size))
         if self.horizontal_fov_rad is not None:
-            fov = float(_finite(self.horizontal_fov_rad, "horizontal_fov_rad"))
+            fov = float(finite(self.horizontal_fov_rad, "horizontal_fov_rad"))
             if not 0 < fov <= 2 * np.pi:
                 raise ValueError(f"horizontal_fov_rad must lie in (0, 2 pi], got {fov}")
             put(self, "horizontal_fov_rad", fov)
@@ -110,15 +111,15 @@ class ObjectGraph:
         Raises:
             ValueError: as `ObjectGraph`.
         """
-        p = _numbers(positions, "positions")
+        p = numbers(positions, "positions")
         if p.shape == (0,):
             p = p.reshape(0, 3)
         if p.ndim != 2:
             raise ValueError(f"positions must have shape (n, 3), got {p.shape}")
         n = len(p)
-        a = np.ones((n, 1)) if attributes is None else _numbers(attributes, "attributes")
-        u = _for_each(position_variance, "position_variance", n)
-        v = _for_each(attribute_variance, "attribute_variance", n)
+        a = np.ones((n, 1)) if attributes is None else numbers(attributes, "attributes")
+        u = for_each(position_variance, "position_variance", n)
+        v = for_each(attribute_variance, "attribute_variance", n)
         return cls(p, a, u, v, **optional)
 
     def take(self, index: NDArray[np.int64]) -> ObjectGraph:
@@ -223,6 +224,7 @@ class Matching:
 
     @classmethod
     def empty(cls) -> Matching:
+        """No match at all."""
         return cls(np.zeros((0, 2), dtype=np.int64), np.zeros(0))
 
 
@@ -264,73 +266,3 @@ def check_comparable(source: ObjectGraph, target: ObjectGraph, prior: RelativePo
         raise ValueError(
             f"source has {source.attributes.shape[1]} attribute classes, target has {target.attributes.shape[1]}"
         )
-
-
-def _numbers(values: ArrayLike, name: str) -> Array:
-    """As float64 array. Raises ValueError naming `name` unless `values` is a regular array of real numbers."""
-    try:
-        array = np.asarray(values)
-    except ValueError as error:  # rows of different lengths
-        raise ValueError(f"{name} must be a regular array of numbers: {error}") from error
-    if array.dtype.kind not in "buif":
-        raise ValueError(f"{name} must be real numbers, got {array.dtype} {values!r:.80}")
-    return array.astype(np.float64, copy=False)
-
-
-def _finite(values: ArrayLike, name: str) -> Array:
-    array = _numbers(values, name)
-    if not np.isfinite(array).all():
-        where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
-        raise ValueError(f"{name} must be finite, got {array[where]} at {where}")
-    return array
-
-
-def _for_each(values: ArrayLike, name: str, n: int) -> Array:
-    """(n,) `values`, or one value for every object."""
-    array = _numbers(values, name)
-    if array.shape not in ((), (n,)):
-        raise ValueError(f"{name} must be one number or have shape ({n},), got {array.shape}")
-    return np.broadcast_to(array, (n,)).copy()
-
-
-def _check_covariances(covariances: Array, n: int) -> None:
-    if covariances.shape != (n, 3, 3):
-        raise ValueError(f"covariances must have shape ({n}, 3, 3), got {covariances.shape}")
-    if n == 0:
-        return
-    difference = np.abs(covariances - covariances.transpose(0, 2, 1))
-    skew = (difference > 1e-9 + 1e-5 * np.abs(covariances)).any(axis=(1, 2))
-    if skew.any():
-        bad = int(np.argmax(skew))
-        raise ValueError(f"covariances must be symmetric, got {covariances[bad].tolist()} at {bad}")
-    lowest = np.linalg.eigvalsh(covariances)[:, 0]
-    if lowest.min() < -1e-6 * max(1e-9, float(np.abs(covariances).max())):
-        bad = int(np.argmin(lowest))
-        raise ValueError(f"covariances must be positive semidefinite, got an eigenvalue {lowest[bad]:.3g} at {bad}")
-
-
-def _pixels(image_size: ArrayLike) -> tuple[int, int]:
-    array = _finite(image_size, "image_size")
-    if array.shape != (2,) or (array < 1).any() or (array != np.round(array)).any():
-        raise ValueError(f"image_size must be (width, height) >= 1 in whole pixels, got {image_size!r}")
-    return int(array[0]), int(array[1])
-
-
-def _variance(values: ArrayLike, name: str, n: int) -> Array:
-    array = _numbers(values, name)
-    if array.shape != (n,):
-        raise ValueError(f"{name} must have shape ({n},), got {array.shape}")
-    if n and not (array >= 0).all():
-        bad = int(np.argmin(array >= 0))
-        raise ValueError(f"{name} must be non-negative, got {array[bad]} at {bad}")
-    return array
-
-
-def _unit(values: ArrayLike, name: str) -> Array:
-    array = _finite(values, name)
-    if array.shape != (3,):
-        raise ValueError(f"{name} must have shape (3,), got {array.shape}")
-    length = float(np.linalg.norm(array))
-    if abs(length - 1) > 1e-2:
-        raise ValueError(f"{name} must be a unit vector, its length is {length:.3g}")
-    return array / length

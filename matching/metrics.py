@@ -39,6 +39,7 @@ class Counts:
 
     @property
     def f1(self) -> float:
+        """Harmonic mean of precision and recall; 0 when there was nothing on either side."""
         total = self.retrieved + self.common
         return 2 * self.correct / total if total else 0.0
 
@@ -104,4 +105,5 @@ def recall_at_precision(scores: Array, correct: NDArray[np.bool_], common: int, 
 
 
 def pooled(counts: Sequence[Counts]) -> Counts:
+    """The counts of all pairs of views together."""
     return sum(counts, Counts())

@@ -46,6 +46,7 @@ LIST_CAPACITY = 1 << 18
 
 @njit(cache=True)
 def empty_state(n: int, n_target: int) -> State:
+    """The state of no match at all."""
     size = n * n_target
     return State(
         np.full(n, -1),

@@ -153,10 +153,8 @@ def reweighted_random_walk(
         if total <= 0.0:
             return np.zeros((n, m))
         walk /= total
-        jump = np.exp(inflation * (walk / walk.max() - 1.0)).reshape(n, m)
-        sinkhorn(jump, sinkhorn_iterations, sinkhorn_tolerance, np.exp(-inflation))
-        jump_flat = jump.reshape(size)
-        mixed = walk_weight * walk + (1.0 - walk_weight) * (jump_flat / jump_flat.sum())
+        jump = reweighted(walk, n, m, inflation, sinkhorn_iterations, sinkhorn_tolerance)
+        mixed = walk_weight * walk + (1.0 - walk_weight) * jump
         # An oscillation between two states counts as an end, too.
         change = min(((walk - x) ** 2).sum(), ((walk - before) ** 2).sum())
         before[:] = x
@@ -164,6 +162,16 @@ def reweighted_random_walk(
         if change < tolerance * tolerance:
             break
     return x.reshape(n, m)
+
+
+@njit(cache=True, fastmath=True)
+def reweighted(
+    walk: Array, n: int, m: int, inflation: float, sinkhorn_iterations: int, sinkhorn_tolerance: float
+) -> Array:
+    """Where a step jumps, (n m,) of sum 1: the visits inflated, then made bistochastic."""
+    jump = np.exp(inflation * (walk / walk.max() - 1.0)).reshape(n, m)
+    sinkhorn(jump, sinkhorn_iterations, sinkhorn_tolerance, np.exp(-inflation))
+    return jump.reshape(n * m) / jump.sum()
 
 
 @njit(cache=True, fastmath=True)

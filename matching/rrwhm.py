@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from .candidates import assignment, check_size
 from .graph import Matching, ObjectGraph, check_comparable
 from .pose import Array, RelativePose
-from .random_walk import sinkhorn
+from .random_walk import reweighted
 from .rrwm import check_walk
 from .similarity import contract, nearest_triples, vertex_cosines
 
@@ -122,10 +122,8 @@ def hypergraph_walk(
         if total <= 0.0:
             return np.zeros((n, m))
         walk /= total
-        jump = np.exp(inflation * (walk / walk.max() - 1.0)).reshape(n, m)
-        sinkhorn(jump, sinkhorn_iterations, sinkhorn_tolerance, np.exp(-inflation))
-        jump_flat = jump.reshape(size)
-        new = walk_weight * walk + (1.0 - walk_weight) * (jump_flat / jump_flat.sum())
+        jump = reweighted(walk, n, m, inflation, sinkhorn_iterations, sinkhorn_tolerance)
+        new = walk_weight * walk + (1.0 - walk_weight) * jump
         change = np.sqrt(((new - x) ** 2).sum())
         x = new
         if change < tolerance:
