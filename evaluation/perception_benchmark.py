@@ -64,7 +64,7 @@ def perception_benchmark(
     targets = default_targets() if targets is None else targets
     tallies: dict[PerceptionTarget, Tally] = {}
     rows = []
-    computed = {"precision": str(dense_type(LearnedPerceptionParams().precision)).removeprefix("torch.")}
+    computed = {"computed_in": str(dense_type(LearnedPerceptionParams().precision)).removeprefix("torch.")}
     for n, target in enumerate(targets):
         part = partial(_part_of, progress, n, images, len(targets))
         tallies[target] = tally(target, weights, images, (key, seed), samples, part)

@@ -36,7 +36,7 @@ class Tally:
         u, v: (k,) reported uncertainties; across (k,) m^2, reported variance per axis across the viewing ray.
         attributes, true_class: (k, c), (k,).
         size: (k,) visible pixels.
-        known: (k, 4) `variance_features` of the reported variances.
+        known: (k, VARIANCE_TERMS) `variance_features` of the reported variances.
         milliseconds: per image.
     """
 
@@ -136,7 +136,8 @@ def _known(seen: Seen, found: NDArray[np.int64]) -> Array:
     from ..agents.perception.weights import variance_features
 
     variance, depth = seen.depth_variance[found], seen.depth[found]
-    return variance_features(variance / depth**2, seen.depth_epistemic[found] / variance, seen.scores[found])
+    share = seen.depth_epistemic[found] / variance
+    return variance_features(variance / depth**2, share, seen.scores[found], depth, seen.pixels[found])
 
 
 def match_masks(masks: NDArray[np.bool_], instances: NDArray[np.int32], pixels: NDArray[np.int64]) -> NDArray[np.int64]:

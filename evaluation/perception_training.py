@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 FIGURES = ("ap50", "class_accuracy", "depth_abs_rel", "depth_spearman", "ence")
 MEDIAN_CHI_SQUARED_2 = 2 * np.log(2)
 SMALLEST_TALLY = 30
-RIDGE = 0.003
+RIDGE = 0.001
 SMALLEST_ERROR = 0.01
 
 
@@ -116,7 +116,7 @@ def _variance_correction(known: Sequence[Array], ratios: Sequence[Array]) -> tup
     """Coefficients of the log of the factor on the variance that make the errors of all scenes together most likely.
 
     Args:
-        known: (k, 4) features of each scene's detections.
+        known: (k, VARIANCE_TERMS) features of each scene's detections.
         ratios: (k,) squared errors over reported variances.
     """
     features, ratio = np.concatenate(known), np.concatenate(ratios)

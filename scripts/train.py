@@ -33,7 +33,7 @@ def perception(
         str, typer.Option(help="compact (ours) | maskrcnn (the paper's; needs torchvision).")
     ] = "compact",
     validation_images: Annotated[int, typer.Option(help="Per scene, for figures on the way; 0 = none.")] = 16,
-    calibration_images: Annotated[int, typer.Option(help="Per scene, to calibrate uncertainty; 0 = do not.")] = 120,
+    calibration_images: Annotated[int, typer.Option(help="Per scene, to calibrate uncertainty; 0 = do not.")] = 300,
 ) -> None:
     """Learn to see objects, their classes and distances, from frames of the four scenes rendered on the fly.
 

@@ -253,11 +253,11 @@ class LearnedPerception:
         seen = depth_features(dense, geometry, image, pixels.reshape(-1, 2), box)
         log_depth, log_variance = self.network.depth(seen, T > 1, generator, draws=T)
         return self._summarised(
-            log_depth.view(T, n, D), log_variance.view(T, n, D), float(geometry.focal[0]), found.scores
+            log_depth.view(T, n, D), log_variance.view(T, n, D), float(geometry.focal[0]), found.scores, found.pixels
         )
 
     def _summarised(
-        self, log_depth: Tensor, log_variance: Tensor, focal: float, scores: Array
+        self, log_depth: Tensor, log_variance: Tensor, focal: float, scores: Array, pixels: NDArray[np.int64]
     ) -> tuple[Array, Array, Array]:
         """Depth (n,), its variance and the epistemic part of that, calibrated, of samples (T, n, pixels)."""
         z = focal / REFERENCE_FOCAL_PX * torch.exp(log_depth.double())
@@ -266,7 +266,7 @@ class LearnedPerception:
         aleatoric = (z**2 * torch.exp(log_variance.double())).mean((0, 2)).numpy()
         epistemic = z.var(0, unbiased=False).mean(1).numpy()
         variance = aleatoric + epistemic
-        known = stored.variance_features(variance / depth**2, epistemic / variance, scores)
+        known = stored.variance_features(variance / depth**2, epistemic / variance, scores, depth, pixels)
         factor = self.calibration.variance_factor(known)
         return depth, factor * variance, factor * epistemic
 

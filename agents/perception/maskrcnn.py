@@ -290,7 +290,7 @@ class MaskRCNNPerception(LearnedPerception):
         maps = self.network.depth(2 * image[None] - 1)
         seen = bilinear(maps, torch.zeros(n * D, dtype=torch.int64), pixels, STRIDE)
         log_depth, log_variance = self.network.depth.read(seen, T > 1, generator, T)
-        return self._summarised(log_depth.view(T, n, D), log_variance.view(T, n, D), focal, found.scores)
+        return self._summarised(log_depth.view(T, n, D), log_variance.view(T, n, D), focal, found.scores, found.pixels)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...matching.pose import Array
 
 TENSORS = "eyes.safetensors"
 MANIFEST = "eyes.json"
-FORMAT, VERSION = "covis-eyes", 2
+FORMAT, VERSION = "covis-eyes", 3
 SHIPPED = Path(__file__).parent / "weights"
 """The folder of the weights that come with the package."""
 
@@ -25,8 +26,11 @@ class WeightsError(RuntimeError):
     """Weights that are missing, altered or of another format; the message names the file."""
 
 
-VARIANCE_FEATURES = ("constant", "variance", "epistemic", "confidence")
-"""Of what the correction of a depth's variance is a linear function, see `variance_features`."""
+QUANTITIES = {"variance": 0.003, "epistemic": 0.2, "confidence": 1.0, "depth": 8.0, "pixels": 300.0}
+"""Of what the correction of a depth's variance is a function, each with a usual value, see `variance_features`."""
+VARIANCE_TERMS = (len(QUANTITIES) + 1) * (len(QUANTITIES) + 2) // 2
+FARTHEST = 3.0
+"""Quantities are held within a factor e^3 of the usual: a square is no guide beyond what calibration has seen."""
 
 
 @dataclass(frozen=True)
@@ -35,14 +39,14 @@ class Calibration:
 
     Attributes:
         scale, exponent: a depth of z m is corrected to scale * z ** exponent.
-        depth: coefficients, one per `VARIANCE_FEATURES`, of the log of the factor on its variance.
+        depth: coefficients of the `variance_features` in the log of the factor on its variance.
         centre: factor on the variance of the projected centre.
         class_temperature: logits are divided by it.
     """
 
     scale: float = 1.0
     exponent: float = 1.0
-    depth: tuple[float, ...] = (0.0,) * len(VARIANCE_FEATURES)
+    depth: tuple[float, ...] = (0.0,) * VARIANCE_TERMS
     centre: float = 1.0
     class_temperature: float = 1.0
 
@@ -52,29 +56,31 @@ class Calibration:
             if not (np.isfinite(value) and value > 0):
                 raise ValueError(f"Calibration.{name} must be positive, got {value}")
         object.__setattr__(self, "depth", tuple(self.depth))
-        if len(self.depth) != len(VARIANCE_FEATURES) or not np.isfinite(self.depth).all():
-            raise ValueError(f"Calibration.depth must be {len(VARIANCE_FEATURES)} finite numbers, got {self.depth}")
+        if len(self.depth) != VARIANCE_TERMS or not np.isfinite(self.depth).all():
+            raise ValueError(f"Calibration.depth must be {VARIANCE_TERMS} finite numbers, got {self.depth}")
 
     def variance_factor(self, features: Array) -> Array:
-        """Factor (n,) on variances with such features (n, 4)."""
+        """Factor (n,) on variances with such features (n, VARIANCE_TERMS)."""
         return np.exp(features @ np.array(self.depth))
 
 
-def variance_features(relative: Array, epistemic: Array, confidence: Array) -> Array:
-    """What is known of how sure n depths are (n, 4), all as logarithms.
+def variance_features(
+    relative: Array, epistemic: Array, confidence: Array, depth: Array, pixels: NDArray[np.int64]
+) -> Array:
+    """What is known of how sure n depths are (n, VARIANCE_TERMS): 1, five logarithms, and all products of two of them.
 
     Args:
         relative: (n,) reported variance over the squared depth.
         epistemic: (n,) share of the variance between samples in that.
         confidence: (n,) that this is an object.
+        depth: (n,) m.
+        pixels: (n,) visible.
     """
-    columns = (
-        np.ones_like(relative),
-        np.log(np.maximum(relative, 1e-8) / 0.003),
-        np.log(np.maximum(epistemic, 0.02) / 0.2),
-        np.log(np.maximum(confidence, 0.05)),
-    )
-    return np.stack(columns, axis=1)
+    raw = (relative, np.maximum(epistemic, 0.02), np.maximum(confidence, 0.05), depth, pixels.astype(np.float64))
+    logs = [np.log(np.maximum(x, 1e-8) / usual) for x, usual in zip(raw, QUANTITIES.values(), strict=True)]
+    x = np.clip(logs, -FARTHEST, FARTHEST)
+    products = [x[i] * x[j] for i in range(len(x)) for j in range(i, len(x))]
+    return np.stack([np.ones(len(relative)), *x, *products], axis=1)
 
 
 @dataclass(frozen=True, eq=False)

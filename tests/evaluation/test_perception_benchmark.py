@@ -84,7 +84,7 @@ def gaussian_tally(scale: float, n: int = 4000, seed: int = 0) -> Tally:
         true_distance=[distance - error],
         depth_ratio=[np.ones(n)],
         size=[rng.uniform(60, 600, n)],
-        known=[variance_features(u / distance**2, np.full(n, 0.2), np.ones(n))],
+        known=[variance_features(u / distance**2, np.full(n, 0.2), np.ones(n), distance, rng.uniform(60, 600, n))],
     )
 
 
@@ -132,7 +132,7 @@ def test_calibration_learns_that_doubtful_objects_err_more_than_reported():
     biased.error = [biased.error[0] / confidence]
     biased.true_distance = [biased.distance[0] - biased.error[0]]
     relative = biased.u[0] / biased.distance[0] ** 2
-    biased.known = [variance_features(relative, np.full(n, 0.2), confidence)]
+    biased.known = [variance_features(relative, np.full(n, 0.2), confidence, biased.distance[0], np.full(n, 300.0))]
     factor = calibrate([biased]).variance_factor(biased.known[0])
     assert np.corrcoef(np.log(factor), -np.log(confidence))[0, 1] > 0.95
     corrected, squared = factor * biased.u[0], biased.error[0] ** 2
