@@ -18,6 +18,8 @@ from .registration import rotation_between
 
 UP = np.array([0.0, 0.0, 1.0])
 TILT_STD_RAD = 1e-3
+NEWBORN = np.diag([1e-6, 1e-6, 1e-4, 1e-8])
+"""m^2 and rad^2 added to a proposed pose."""
 LOG_2PI = float(np.log(2 * np.pi))
 
 
@@ -84,6 +86,22 @@ class Choice:
     probability: float
     component: int
     hypothesis: int
+
+
+@dataclass(frozen=True, eq=False)
+class Explained:
+    """A frame as one component explains it.
+
+    Attributes:
+        component: its index.
+        mean, covariance: (4,), (4, 4) of the pose after the frame, levelled.
+        log_evidence: of the frame given that the component is right.
+    """
+
+    component: int
+    mean: Array
+    covariance: Array
+    log_evidence: float
 
 
 class PoseFilter:
@@ -161,7 +179,7 @@ class PoseFilter:
         p = np.asarray(probabilities, dtype=np.float64) * (1 - o.overlooked)
         none = max(1.0 - float(p.sum()), o.overlooked)
         p, none = p**share, none**share
-        C_new = covariances / share + np.diag([1e-6, 1e-6, 1e-4, 1e-8])
+        C_new = covariances / share + NEWBORN
         if k == 0 and h == 0:
             return Choice(0.0, -1, -1)
         log_volume = float(np.log(o.extent_m**2 * 2.0 * 2 * np.pi))
@@ -196,6 +214,47 @@ class PoseFilter:
         self._merge(all_means, 0.5 * (all_covariances + all_covariances.transpose(0, 2, 1)), weights)
         return Choice(float(self.weights[0]), int(origin[top, 0]), int(origin[top, 1]))
 
+    def reweigh(
+        self,
+        explained: Sequence[Explained],
+        log_evidence: float,
+        means: Array,
+        covariances: Array,
+        probabilities: Array,
+    ) -> None:
+        """Take in a frame that was matched once with every likely component as prior, and once with none.
+
+        Components that were not asked join the unknown.
+
+        Args:
+            explained: what the frame says under the components.
+            log_evidence: of the frame where none of them is right.
+            means, covariances, probabilities: (h, 4), (h, 4, 4), (h,) of the poses proposed in that case.
+        """
+        o = self.options
+        share = o.independence
+        known = float(sum(self.weights[e.component] for e in explained))
+        log_unknown = np.log(max(1.0 - known, 1e-12)) + share * log_evidence
+        p = np.asarray(probabilities, dtype=np.float64)
+        none = max(1.0 - float(p.sum()), o.overlooked) ** share
+        born = (p * (1 - o.overlooked)) ** share
+        logs = np.array(
+            [np.log(max(self.weights[e.component], 1e-12)) + share * e.log_evidence for e in explained]
+            + [log_unknown + np.log(x / (none + born.sum())) for x in born]
+        )
+        log_none = log_unknown + np.log(none / (none + born.sum()))
+        top = max(log_none, logs.max(initial=-np.inf))
+        weights = np.exp(logs - top)
+        total = float(weights.sum()) + float(np.exp(log_none - top))
+        self.unknown = float(np.exp(log_none - top)) / total
+        self._merge(
+            np.concatenate([np.array([e.mean for e in explained]).reshape(-1, 4), means]),
+            np.concatenate(
+                [np.array([e.covariance for e in explained]).reshape(-1, 4, 4), covariances / share + NEWBORN]
+            ),
+            weights / total,
+        )
+
     def best(self) -> tuple[Array, Array, float] | None:
         """Mean (4,), covariance (4, 4) and probability of the most likely component."""
         if len(self.weights) == 0:
@@ -206,7 +265,7 @@ class PoseFilter:
     def _merge(self, means: Array, covariances: Array, weights: Array) -> None:
         """Join components that say the same, strongest first; keep the most likely."""
         order = np.argsort(-weights)
-        order = order[weights[order] > 1e-5 * weights[order[0]]]
+        order = order[weights[order] > 1e-5 * weights.max(initial=0.0)]
         means, covariances, weights = means[order], covariances[order], weights[order]
         open_ = np.ones(len(order), dtype=np.bool_)
         out: list[tuple[Array, Array, float]] = []
@@ -225,8 +284,8 @@ class PoseFilter:
             covariance = np.tensordot(w, covariances[near], axes=1) + (spread * w[:, None]).T @ spread
             out.append((mean, covariance, float(weights[near].sum())))
         out.sort(key=lambda c: -c[2])
-        self.means = np.array([c[0] for c in out])
-        self.covariances = np.array([c[1] for c in out])
+        self.means = np.array([c[0] for c in out]).reshape(-1, 4)
+        self.covariances = np.array([c[1] for c in out]).reshape(-1, 4, 4)
         self.weights = np.array([c[2] for c in out])
         self.unknown = max(1.0 - float(self.weights.sum()), 1e-9)
 

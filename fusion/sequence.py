@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
+from ..matching.bayes_solve import decode
 from ..matching.graph import Matcher, Matching, ObjectGraph
 from ..matching.pose import Array, RelativePose, invert
-from .posefilter import Choice, PoseFilter, PoseFilterOptions, from_levelled, level_motion, to_levelled
+from .posefilter import Choice, Explained, PoseFilter, PoseFilterOptions, from_levelled, level_motion, to_levelled
 from .registration import RegistrationError, register
 
 MAX_SPREAD = 1e4
@@ -30,6 +32,9 @@ class PairOptions:
         refuse: while none is trusted, matches whose score times the best pose's probability is lower are not made.
         widen: factor on the covariance of a prior without odometry; above 1 because errors of successive views are
             alike, and because cars turn faster than persistence expects.
+        asked: components less likely than this are not handed to the matcher as priors; at most `max_asked` are.
+        common: probability that views of a pair whose pose is known share any object.
+        least_score: matches of a lower averaged probability are not made, unless the matcher's `min_score` is given.
         min_registered: matches a matcher without poses must give for one to be estimated.
         map_independence: share of what matching the local maps says in a frame that is new.
         beside_maps: in place of the filter's `independence` for views matched beside maps, which hold them too.
@@ -39,6 +44,10 @@ class PairOptions:
     trust: float = 0.7
     refuse: float = 0.3
     widen: float = 4.0
+    asked: float = 0.02
+    max_asked: int = 3
+    common: float = 0.9
+    least_score: float = 0.42
     min_registered: int = 4
     map_independence: float = 0.05
     beside_maps: float = 0.1
@@ -131,6 +140,8 @@ class PairTracker:
             self._carry(source.up, target.up)
         self._pending.clear()
         self._ups = (source.up, target.up)
+        if maps is None and not self._odometry and weighable(alone):
+            return self._match_each(matcher, source, target, alone, rng, options)
         if maps is not None:
             found = propose(*maps, matcher(*maps, prior=None, rng=rng, **options), self.options.min_registered)
             self._absorb(found, self.options.map_independence)
@@ -150,6 +161,50 @@ class PairTracker:
         matching = matcher(source, target, prior=prior, rng=rng, **options)
         self._follow(matching)
         return matching
+
+    def _match_each(
+        self,
+        matcher: Matcher,
+        source: ObjectGraph,
+        target: ObjectGraph,
+        alone: Matching,
+        rng: np.random.Generator | None,
+        options: Mapping[str, Any],
+    ) -> Matching:
+        """The matcher is asked with every likely pose as prior; matches are averaged over what each makes of the frame.
+
+        So no pose has to be trusted before the frames have decided between the poses.
+        """
+        assert self._ups is not None
+        o, filter_ = self.options, self.filter
+        likely = [k for k in np.argsort(-filter_.weights)[: o.max_asked] if filter_.weights[k] >= o.asked]
+        answers: list[Matching] = []
+        explained: list[Explained] = []
+        for k in likely:
+            prior = from_levelled(filter_.means[k], filter_.covariances[k] * o.widen, *self._ups)
+            answers.append(matcher(source, target, prior=prior, rng=rng, **options))
+            explained.append(self._explained(int(k), answers[-1]))
+        log_unknown = log_evidence(alone)
+        known = filter_.weights[likely]
+        logs = np.log(np.maximum([1.0 - known.sum(), *known], 1e-12))
+        logs += np.array([log_unknown, *(e.log_evidence for e in explained)])
+        weights = np.exp(logs - logs.max())
+        weights /= weights.sum()
+        matching = average([alone, *answers], weights, options.get("min_score", o.least_score))
+        found = propose(source, target, alone, o.min_registered)
+        filter_.reweigh(explained, log_unknown, *_levelled(found, *self._ups))
+        return matching
+
+    def _explained(self, component: int, matching: Matching) -> Explained:
+        assert self._ups is not None
+        mean, covariance = self.filter.means[component], self.filter.covariances[component]
+        if matching.pose is not None and len(matching) >= 2:
+            # The matcher's pose contains the prior already.
+            mean, covariance = to_levelled(matching.pose, *self._ups)
+            covariance = covariance + FOLLOW_FLOOR
+        common = self.options.common
+        evidence = np.logaddexp(np.log(common) + matching.diagnostics["log_evidence"], np.log1p(-common))
+        return Explained(component, mean, covariance, float(evidence))
 
     def _follow(self, matching: Matching) -> None:
         """Without odometry: let the trusted component go where the matches made with it as prior put the pose."""
@@ -173,10 +228,35 @@ class PairTracker:
 
     def _absorb(self, found: list[tuple[RelativePose, float]], independence: float | None = None) -> Choice:
         assert self._ups is not None
-        levelled = [to_levelled(pose, *self._ups) for pose, _ in found]
-        means = np.array([m for m, _ in levelled]).reshape(-1, 4)
-        covariances = np.array([C for _, C in levelled]).reshape(-1, 4, 4)
-        return self.filter.update(means, covariances, np.array([p for _, p in found]), independence)
+        return self.filter.update(*_levelled(found, *self._ups), independence)
+
+
+def _levelled(
+    found: list[tuple[RelativePose, float]], up_source: Array, up_target: Array
+) -> tuple[Array, Array, Array]:
+    """Means (h, 4), covariances (h, 4, 4) and probabilities (h,) of poses with probabilities."""
+    levelled = [to_levelled(pose, up_source, up_target) for pose, _ in found]
+    means = np.array([m for m, _ in levelled]).reshape(-1, 4)
+    covariances = np.array([C for _, C in levelled]).reshape(-1, 4, 4)
+    return means, covariances, np.array([p for _, p in found])
+
+
+def weighable(matching: Matching) -> bool:
+    """Whether a matching says how well the views fit together, and how probable every single match is."""
+    return {"log_evidence", "probabilities"} <= matching.diagnostics.keys()
+
+
+def log_evidence(matching: Matching) -> float:
+    """Of two views whose pose is not known, over that of views that share nothing; those are as likely beforehand."""
+    return float(np.logaddexp(0.0, matching.diagnostics["log_evidence"]) + np.log(0.5))
+
+
+def average(matchings: Sequence[Matching], weights: Array, least_score: float) -> Matching:
+    """One-to-one matches by probabilities averaged over alternatives, with the likeliest alternative's pose."""
+    P = np.tensordot(weights, np.stack([m.diagnostics["probabilities"] for m in matchings]), axes=1)
+    pairs, scores = decode(np.minimum(P, 1.0), least_score)
+    likeliest = matchings[int(np.argmax(weights))]
+    return replace(likeliest, pairs=pairs, scores=scores, diagnostics={**likeliest.diagnostics, "probabilities": P})
 
 
 def _believed(matching: Matching, probability: float, refuse: float) -> Matching:

@@ -82,7 +82,8 @@ def bayes(
 
     Returns:
         Matches with their posterior probabilities; `pose` (None when refused) and `hypotheses` of the modes;
-        `diagnostics["nothing_in_common"]`, the probability of that.
+        `diagnostics["nothing_in_common"]`, the probability of that; `["probabilities"]` (n, m) of all matches;
+        `["log_evidence"]` of the views given that they share objects, over their evidence given that they do not.
 
     Raises:
         ValueError: graphs of different classes, or an option out of its range.
@@ -146,7 +147,12 @@ def bayes(
         scores,
         pose=None if refused or likeliest is None else likeliest.pose,
         hypotheses=hypotheses,
-        diagnostics={"nothing_in_common": float(weights[0]), "modes": len(modes.log_evidence), "probabilities": P},
+        diagnostics={
+            "nothing_in_common": float(weights[0]),
+            "modes": len(modes.log_evidence),
+            "probabilities": P,
+            "log_evidence": float(np.logaddexp.reduce(modes.log_evidence, initial=-math.inf)),
+        },
     )
 
 

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from covis.fusion.posefilter import (
+    Explained,
     PoseFilter,
     PoseFilterOptions,
     beliefs,
@@ -263,3 +264,87 @@ def test_motions_are_levelled():
 def test_bad_filter_options_raise(field, value):
     with pytest.raises(ValueError, match=field):
         PoseFilterOptions(**{field: value})
+
+
+def test_components_are_reweighed_by_what_the_frame_says_under_each():
+    filter_ = PoseFilter(PoseFilterOptions(independence=0.5, overlooked=0.1))
+    means, C = np.array([[0.0, 0, 0, 0], [20.0, 0, 0, 1]]), 0.01 * np.eye(4)
+    filter_.means, filter_.covariances = means, np.stack([C, C])
+    filter_.weights, filter_.unknown = np.array([0.6, 0.3]), 0.1
+    evidence = np.array([1.0, 5.0])
+    explained = [Explained(k, means[k], C, evidence[k]) for k in range(2)]
+    filter_.reweigh(explained, 2.0, np.array([[50.0, 0, 0, 2]]), C[None], np.array([0.8]))
+    share = np.sqrt([0.8 * 0.9, 0.2])
+    born, none = 0.1 * np.exp(0.5 * 2.0) * share / share.sum()
+    expected = np.array([0.6 * np.exp(0.5), 0.3 * np.exp(2.5), born, none])
+    expected /= expected.sum()
+    order = np.argsort(-expected[:3])
+    assert filter_.weights == pytest.approx(expected[:3][order])
+    assert filter_.unknown == pytest.approx(expected[3])
+    assert filter_.means == pytest.approx(np.array([*means, [50.0, 0, 0, 2]])[order])
+
+
+def test_components_that_were_not_asked_join_the_unknown():
+    filter_ = PoseFilter()
+    filter_.means, filter_.covariances = np.zeros((2, 4)), np.stack([np.eye(4)] * 2)
+    filter_.weights, filter_.unknown = np.array([0.9, 0.01]), 0.09
+    nothing = np.zeros((0, 4)), np.zeros((0, 4, 4)), np.zeros(0)
+    filter_.reweigh([Explained(0, np.zeros(4), np.eye(4), 0.0)], 0.0, *nothing)
+    assert filter_.weights == pytest.approx([0.9])
+    filter_.reweigh([], 0.0, *nothing)
+    assert len(filter_.weights) == 0
+    assert filter_.unknown == pytest.approx(1.0)
+
+
+def weighing_matcher(T_true, favourite):
+    """Without a prior: a favourite pose and the true one, little evidence; with one: much evidence near the truth."""
+
+    def matcher(source, target, *, prior=None, rng=None):
+        straight = np.stack([np.arange(len(source))] * 2, axis=1)
+        rolled = np.stack([straight[:, 0], np.roll(straight[:, 1], 1)], axis=1)
+
+        def matching(pairs, probability, pose, evidence, hypotheses=()):
+            P = np.zeros((len(source), len(target)))
+            P[pairs[:, 0], pairs[:, 1]] = probability
+            said = {"probabilities": P, "log_evidence": evidence}
+            scores = np.full(len(pairs), probability)
+            return Matching(pairs, scores, pose=pose, hypotheses=hypotheses, diagnostics=said)
+
+        true = RelativePose(T_true, spread(0.1, 0.1, 0.02))
+        if prior is None:
+            wrong = RelativePose(favourite, spread(0.1, 0.1, 0.02))
+            found = [(wrong, 0.6, rolled), (true, 0.35, straight)]
+            hypotheses = tuple(Hypothesis(T, p, pairs, np.full(len(pairs), p)) for T, p, pairs in found)
+            return matching(rolled, 0.6, wrong, 3.0, hypotheses)
+        if np.linalg.norm(log_se3(invert(prior.T_source_target) @ T_true)[:3]) < 1:
+            return matching(straight, 0.99, true, 8.0)
+        return matching(rolled[:1], 0.3, prior, -2.0)
+
+    return matcher
+
+
+def test_the_pose_that_explains_frame_after_frame_wins_without_odometry():
+    rng = np.random.default_rng(6)
+    tracker, right = PairTracker(), []
+    for k in range(12):
+        T = turned(0.3, Z_UP, (6.0, 0.1 * k, 0.0))
+        favourite = turned(0.3 + 0.7 * k, Z_UP, (-6.0, 2.0 * k, 0.0))
+        tracker.predict()
+        matching = tracker.match(weighing_matcher(T, favourite), *graphs(rng, T))
+        right.append(len(matching) == 6 and (matching.pairs[:, 0] == matching.pairs[:, 1]).all())
+    assert not right[0]
+    assert all(right[4:])
+    assert matching.pose.T_source_target == pytest.approx(T, abs=1e-6)
+
+
+def test_a_wrong_pose_is_given_up_when_another_explains_more():
+    rng = np.random.default_rng(7)
+    T, wrong = turned(0.3, Z_UP, (6.0, 0, 0.0)), turned(2.0, Z_UP, (-6.0, 0, 0.0))
+    tracker = PairTracker()
+    for k in range(30):
+        truth = wrong if k < 8 else T
+        tracker.predict()
+        tracker.match(weighing_matcher(truth, turned(0.4 * k, Z_UP, (9.0 + 2 * k, 0, 0.0))), *graphs(rng, truth))
+        if k == 7:
+            assert tracker.filter.best()[0][:3] == pytest.approx([-6, 0, 0], abs=0.1)
+    assert tracker.filter.best()[0][:3] == pytest.approx([6, 0, 0], abs=0.1)

@@ -179,6 +179,8 @@ def test_refuses_where_nothing_is_common():
         retrieved += len(matching)
         refused += matching.pose is None
         assert 0 <= matching.diagnostics["nothing_in_common"] <= 1
+        shared = np.exp(matching.diagnostics["log_evidence"])
+        assert matching.diagnostics["nothing_in_common"] == pytest.approx(1 / (1 + shared))
     assert refused >= 15
     assert retrieved <= 20
 
