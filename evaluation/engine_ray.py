@@ -16,7 +16,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-from .engine import Executor, Failure, Outcome, RunOne, RunOneUnit, WorkerDiedError
+from .executors import Executor, Failure, Outcome, RunOne, RunOneUnit, WorkerDiedError
 from .experiments import Unit
 from .extras import require
 from .provenance import PACKAGES, versions

@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 
 from .data_card import card
 from .dataset_tables import FORMAT, VERSION
-from .engine import Done, Executor, Failure, make_executor
+from .engine import make_executor
+from .executors import Done, Executor, Failure
 from .settings import Settings, scene_preset
 from .shards import write_atomically
 

@@ -113,7 +113,7 @@ def frame(page: Page, results: Sequence[tuple[int, Result]], images: Images, tit
         assert sight.image is not None
         parts += [images.use(sight.image, i * offset), _boxes(sight, i * offset)]
     centres = [_centres(sight, i * offset) for i, sight in enumerate(pair)]
-    parts += [lines(method, result, centres, pick) for method, result in results]
+    parts += [topview.match_lines(method, result, centres, pick) for method, result in results]
     parts += [_plate(sight.robot, i * offset) for i, sight in enumerate(pair)]
     size = f"0 0 {width} {2 * height + GAP}"
     return h("svg", {"viewBox": size, "class": "picture", "role": "img", "aria-label": title}, parts)
@@ -129,22 +129,6 @@ def _boxes(sight: Sight, offset: float) -> Element:
         for u0, v0, u1, v1 in sight.boxes
     )
     return h("path", {"class": "boxes", "d": d})
-
-
-def lines(method: int, result: Result, centres: Sequence[Sequence[tuple[float, float]]], pick: bool) -> Element:
-    """Matches between the first two robots, wrong ones below right ones."""
-    drawn: dict[bool, list[str]] = {False: [], True: []}
-    for robots, (i, j), hit in zip(result.robots, result.pairs, result.hits, strict=True):
-        if robots == [0, 1] and i < len(centres[0]) and j < len(centres[1]):
-            (u, v), (x, y) = centres[0][i], centres[1][j]
-            drawn[hit].append(f"M{number(u)} {number(v)}L{number(x)} {number(y)}")
-    paths = []
-    for hit in (False, True):
-        if drawn[hit]:
-            d = "".join(drawn[hit])
-            kind = "right" if hit else "wrong"
-            paths += [h("path", {"class": f"halo {kind}-halo", "d": d}), h("path", {"class": kind, "d": d})]
-    return h("g", {"data-pick": method} if pick else {}, paths)
 
 
 def _plate(name: str, offset: float) -> Element:

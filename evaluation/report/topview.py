@@ -66,8 +66,6 @@ def scale_bar(view: View) -> Element:
 
 def two_graphs(page: Page, results: Sequence[tuple[int, Result]], title: str, pick: bool) -> Element:
     """For frames without images: both robots' detections from above, in the world where the true poses are known."""
-    from .matches import lines
-
     a, b = page.sights[:2]
     flat = [_flat(s.places) for s in (a, b)]
     parts: list[Child] = []
@@ -82,7 +80,7 @@ def two_graphs(page: Page, results: Sequence[tuple[int, Result]], title: str, pi
         views = [view_of(np.concatenate([p, np.zeros((1, 2))]), WIDTH / 2, i * WIDTH / 2) for i, p in enumerate(flat)]
         parts += [_robot(i, views[i]((0.0, 0.0)), s.robot) for i, s in enumerate((a, b))]
     centres = [[view(p) for p in points] for view, points in zip(views, flat, strict=True)]
-    parts += [lines(method, result, centres, pick) for method, result in results]
+    parts += [match_lines(method, result, centres, pick) for method, result in results]
     for i, own in enumerate(centres):
         parts.append(
             h("g", {"class": f"robot-{i}"}, [h("circle", {"class": "dot", "cx": u, "cy": v, "r": 3}) for u, v in own])
@@ -90,6 +88,22 @@ def two_graphs(page: Page, results: Sequence[tuple[int, Result]], title: str, pi
     if known:
         parts.append(scale_bar(both))
     return _map(title, parts)
+
+
+def match_lines(method: int, result: Result, centres: Sequence[Sequence[tuple[float, float]]], pick: bool) -> Element:
+    """Matches between the first two robots, wrong ones below right ones."""
+    drawn: dict[bool, list[str]] = {False: [], True: []}
+    for robots, (i, j), hit in zip(result.robots, result.pairs, result.hits, strict=True):
+        if robots == [0, 1] and i < len(centres[0]) and j < len(centres[1]):
+            (u, v), (x, y) = centres[0][i], centres[1][j]
+            drawn[hit].append(f"M{number(u)} {number(v)}L{number(x)} {number(y)}")
+    paths = []
+    for hit in (False, True):
+        if drawn[hit]:
+            d = "".join(drawn[hit])
+            kind = "right" if hit else "wrong"
+            paths += [h("path", {"class": f"halo {kind}-halo", "d": d}), h("path", {"class": kind, "d": d})]
+    return h("g", {"data-pick": method} if pick else {}, paths)
 
 
 def _map(title: str, parts: Child) -> Element:

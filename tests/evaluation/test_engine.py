@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from covis.evaluation import engine, experiments
+from covis.evaluation import engine, executors, experiments
 from covis.evaluation.benchmark import benchmark
-from covis.evaluation.engine import Done, Failure, RunOne, UnitFailedError, WorkerDiedError, make_executor, run
+from covis.evaluation.engine import UnitFailedError, make_executor, run
+from covis.evaluation.executors import Done, Failure, RunOne, WorkerDiedError
 from covis.evaluation.experiments import Experiment, Unit, UnitResult
 from covis.evaluation.methods import Method
 from covis.evaluation.settings import Settings
@@ -92,7 +93,7 @@ def test_a_failing_unit_is_tried_again_after_the_others(small_dataset, monkeypat
             raise OSError("no space left")
         return UnitResult([], [])
 
-    monkeypatch.setattr(engine, "run_unit", flaky)
+    monkeypatch.setattr(executors, "run_unit", flaky)
     run(_units(3), make_executor())
     assert calls == [(0,), (1,), (2,), (0,), (0,)]
 
@@ -103,7 +104,7 @@ def test_a_unit_that_never_works_is_named_and_the_others_stay(tmp_path, monkeypa
             raise OSError("no space left")
         return UnitResult([], [])
 
-    monkeypatch.setattr(engine, "run_unit", broken)
+    monkeypatch.setattr(executors, "run_unit", broken)
     shards = engine.Shards(tmp_path, 3)
     shards.open({}, {}, resume=False, overwrite=False)
     with pytest.raises(UnitFailedError, match=r"unit 1 \(it, seed 5, episodes 1\) failed 3 times: OSError: no space"):
@@ -142,7 +143,7 @@ def test_errors_that_cannot_be_pickled_keep_their_text(monkeypatch):
     def broken(unit, pictures):
         raise LocalError("no")
 
-    monkeypatch.setattr(engine, "run_unit", broken)
+    monkeypatch.setattr(executors, "run_unit", broken)
     outcome = RunOne(tuple(_units(1)))(0)
     assert isinstance(outcome, Failure)
     assert str(outcome.error) == "LocalError: no"

@@ -7,7 +7,7 @@ import pytest
 
 from covis.evaluation import engine_ray, experiments, extras
 from covis.evaluation.benchmark import benchmark
-from covis.evaluation.engine import Done, RunOne
+from covis.evaluation.executors import Done, RunOne
 from covis.evaluation.extras import MissingExtraError
 from covis.evaluation.methods import Method
 from covis.evaluation.settings import Settings
