@@ -12,7 +12,14 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from ..matching.graph import Matching
-from ..matching.metrics import Counts, count, expected_calibration_error, is_correct
+from ..matching.metrics import (
+    Counts,
+    count,
+    expected_calibration_error,
+    f1_per_pair,
+    is_correct,
+    recall_at_precision,
+)
 from .statistics import bootstrap_interval
 
 SCHEMA = pa.schema(
@@ -114,6 +121,7 @@ class Tally:
     Attributes:
         episodes: by seed and episode, how many matches were correct, were retrieved, were there to be found (3,).
         frames, pairs: how many.
+        counts: (pairs, 3) correct, retrieved and common matches of each pair.
         match_ms: (pairs,).
         scores, hits: of all emitted matches.
         visible: objects that both cameras could see; None where no record knows.
@@ -124,6 +132,7 @@ class Tally:
     episodes: dict[Hashable, NDArray[np.float64]]
     frames: int
     pairs: int
+    counts: NDArray[np.int64]
     match_ms: NDArray[np.float64]
     scores: NDArray[np.float64]
     hits: NDArray[np.bool_]
@@ -146,6 +155,7 @@ class Tally:
             episodes={(int(seed), int(episode)): row for (seed, episode), row in zip(keys, sums, strict=True)},
             frames=len(np.unique(where, axis=0)),
             pairs=len(table),
+            counts=counts.astype(np.int64),
             match_ms=table["match_ms"].to_numpy(),
             scores=_flat(table, "scores"),
             hits=_flat(table, "hits").astype(bool),
@@ -167,6 +177,7 @@ class Tally:
             episodes=episodes,
             frames=sum(t.frames for t in tallies),
             pairs=sum(t.pairs for t in tallies),
+            counts=np.concatenate([np.zeros((0, 3), dtype=np.int64), *(t.counts for t in tallies)]),
             match_ms=np.concatenate([np.zeros(0), *(t.match_ms for t in tallies)]),
             scores=np.concatenate([np.zeros(0), *(t.scores for t in tallies)]),
             hits=np.concatenate([np.zeros(0, dtype=bool), *(t.hits for t in tallies)]),
@@ -190,6 +201,8 @@ class Tally:
             "f1": total.f1,
             "f1_low": low,
             "f1_high": high,
+            "f1_per_pair": _number(f1_per_pair(self.counts)),
+            "recall_at_95_precision": recall_at_precision(self.scores, self.hits, common, 0.95),
             "ece": _number(expected_calibration_error(self.scores, self.hits)),
             "match_ms": float(np.median(self.match_ms)) if self.pairs else None,
             "n_correct": correct,

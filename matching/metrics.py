@@ -44,6 +44,17 @@ class Counts:
         return 2 * self.correct / total if total else 0.0
 
 
+def f1_per_pair(counts: NDArray[np.int64]) -> float:
+    """F1 of each pair of views, averaged; counts (pairs, 3) of correct, retrieved and common matches.
+
+    Unlike pooled F1, a pair of few objects weighs as much as one of many. Pairs that share nothing and of which nothing
+    was claimed say nothing about F1 and are left out; NaN if there is no other.
+    """
+    total = counts[:, 1] + counts[:, 2]
+    said = total > 0
+    return float((2 * counts[said, 0] / total[said]).mean()) if said.any() else float("nan")
+
+
 def is_correct(
     matching: Matching, source_identity: NDArray[np.int64], target_identity: NDArray[np.int64]
 ) -> NDArray[np.bool_]:

@@ -8,6 +8,7 @@ from covis.matching.metrics import (
     Counts,
     count,
     expected_calibration_error,
+    f1_per_pair,
     pooled,
     recall_at_precision,
     reliability,
@@ -35,6 +36,24 @@ def test_counts_pool_before_ratios():
     total = pooled([Counts(1, 1, 4), Counts(0, 3, 0)])
     assert total == Counts(1, 4, 4)
     assert total.precision == 0.25
+
+
+def test_f1_per_pair_weighs_every_pair_alike():
+    # By pair 1 and 18 / 25; of the last there is nothing to say.
+    counts = np.array([[1, 1, 1], [9, 13, 12], [0, 0, 0]])
+    assert f1_per_pair(counts) == pytest.approx((1 + 18 / 25) / 2)
+    assert f1_per_pair(np.array([[0, 2, 0]])) == 0.0
+    assert np.isnan(f1_per_pair(np.zeros((1, 3), dtype=int)))
+
+
+def test_calibration_error_is_not_raised_by_few_matches():
+    """What chance alone makes of 20 matches in ten bins is taken off: else a calibrated matcher would show .15."""
+    rng = np.random.default_rng(2)
+    errors = []
+    for _ in range(200):
+        scores = rng.uniform(0.3, 0.9, 60)
+        errors.append(expected_calibration_error(scores, rng.uniform(0, 1, 60) < scores))
+    assert np.mean(errors) < 0.11
 
 
 def test_calibrated_scores_have_no_calibration_error():
