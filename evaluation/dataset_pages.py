@@ -25,6 +25,18 @@ def page(name: str, frame: Frame, found: Sequence[Matched], teams: Mapping[str, 
     return Page(name, frame.episode, frame.index, "episode", None, [_sight(v) for v in frame.views], results)
 
 
+def shared(frame: Frame) -> dict[int, Array]:
+    """True places (3,) m of the objects that the first two robots both detected, where their true poses are known."""
+    if len(frame.views) < 2:
+        return {}
+    a, b = frame.views[:2]
+    if a.truth is None or a.pose_truth is None or b.pose_truth is None:
+        return {}
+    names, at, _ = np.intersect1d(a.identity, b.identity, return_indices=True)
+    places = zip(names.tolist(), a.truth[at], strict=True)
+    return {name: place for name, place in places if name >= 0 and np.isfinite(place).all()}
+
+
 def _sight(view: View) -> Sight:
     pose = view.pose_truth
     truth: list[list[float] | None] = []

@@ -1,18 +1,21 @@
 """What a report shows of a run beside its numbers: some frames of each unit, with what the robots saw and matched.
 
-A page is one frame. Kept are the frames of the unit that holds a target's first episode (for trajectories; one of them
-with images), and from every unit the worst frame of each of its two best methods, images included. One Parquet file a
-unit, in `pictures/` beside `records/`.
+A page is one frame. Kept are the frames of the unit that holds a target's first episode (one of them with images), from
+every unit the episode in which its first two robots see one moving object in the most frames (for trajectories), and
+the worst frame of each of its two best methods, images included. One Parquet file a unit, in `pictures/` beside
+`records/`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from ..matching.metrics import Counts
 from .methods import EVALUATION_ONLY
@@ -23,7 +26,14 @@ WORST_OF = 2
 """The worst frames of so many of a unit's methods are kept."""
 MIN_COMMON = 3
 """A frame with fewer objects in common is no failure worth looking at."""
+MIN_FRAMES = 3
+"""An object that is followed in fewer frames has no trajectory."""
+MIN_PATH_M = 0.2
+"""An object whose true path is shorter stands still."""
 JPEG_QUALITY = 82
+
+Array = NDArray[np.float64]
+Places = Mapping[int, Array]
 
 FLOATS = pa.list_(pa.float32())
 POINTS = pa.list_(FLOATS)
@@ -140,34 +150,61 @@ class PictureBook:
         self._first = first_episode
         self._in_first_unit = False
         self._episode: list[Page] = []
+        self._running: tuple[int, list[Page], list[Places]] = (-1, [], [])
+        self._longest: tuple[int, list[Page]] = (MIN_FRAMES - 1, [])
         self._showcase: Page | None = None
         self._worst: dict[str, tuple[tuple[float, int], Page]] = {}
         self._totals: dict[str, Counts] = {}
 
-    def see(self, episode: int, counts: Mapping[str, Counts], make_page: Callable[[], Page]) -> None:
-        """One frame: what each method scored in it, and how to make its page, which is called only when wanted."""
+    def see(
+        self,
+        episode: int,
+        counts: Mapping[str, Counts],
+        make_page: Callable[[], Page],
+        shared: Places = MappingProxyType({}),
+    ) -> None:
+        """One frame: what each method scored in it, how to make its page, which is called only when wanted, and the
+        true places (3,) m of the objects that the first two robots both detected."""
         for method, c in counts.items():
             self._totals[method] = self._totals.get(method, Counts()) + c
         worse = [m for m, c in counts.items() if self._is_worst(m, c)]
         self._in_first_unit |= episode == self._first
         followed = self._in_first_unit and len(self._episode) < MAX_EPISODE_PAGES
-        if not worse and not followed:
+        if not worse and not followed and not shared:
             return
         page = make_page()
         for method in worse:
             self._worst[method] = _badness(counts[method]), replace(page, role="worst")
         if followed:
             self._add_to_episode(page, showcase=episode == self._first)
+        elif shared:
+            self._add_to_running(episode, replace(page.without_images(), role="episode"), shared)
 
     def pages(self) -> list[Page]:
-        """What is kept, the first episode before the failures."""
-        kept = list(self._episode)
+        """What is kept, episodes before the failures."""
+        self._end_running()
+        kept = [*self._episode, *self._longest[1]]
         ranked = sorted(self._worst, key=lambda m: -self._totals[m].f1)
         for method in ranked[:WORST_OF]:
             page = self._worst[method][1]
             if page not in kept:
                 kept.append(page)
         return kept
+
+    def _add_to_running(self, episode: int, page: Page, shared: Places) -> None:
+        if episode != self._running[0]:
+            self._end_running()
+            self._running = (episode, [], [])
+        self._running[1].append(page)
+        self._running[2].append(shared)
+
+    def _end_running(self) -> None:
+        """Keep the episode that has ended if its longest shared view is the longest yet."""
+        _, pages, shared = self._running
+        frames = longest_shared(shared)
+        if frames > self._longest[0]:
+            self._longest = frames, pages
+        self._running = (-1, [], [])
 
     def _is_worst(self, method: str, counts: Counts) -> bool:
         if method in EVALUATION_ONLY or counts.common < MIN_COMMON:
@@ -183,6 +220,19 @@ class PictureBook:
             self._episode.append(self._showcase)
         else:
             self._episode.append(replace(page.without_images(), role="episode"))
+
+
+def longest_shared(frames: Sequence[Places]) -> int:
+    """The most frames of an episode in which both robots saw one and the same moving object."""
+    seen: dict[int, list[Array]] = {}
+    for shared in frames:
+        for identity, place in shared.items():
+            seen.setdefault(identity, []).append(place)
+    return max((len(places) for places in seen.values() if _length(places) >= MIN_PATH_M), default=0)
+
+
+def _length(places: Sequence[Array]) -> float:
+    return float(np.linalg.norm(np.diff(np.array(places), axis=0), axis=1).sum())
 
 
 def _badness(counts: Counts) -> tuple[float, int]:

@@ -12,7 +12,7 @@ import numpy as np
 from ..matching import Matching
 from ..matching.metrics import Counts, is_correct
 from .dataset_errors import Matched, fused, with_errors
-from .dataset_pages import page
+from .dataset_pages import page, shared
 from .datasets import Dataset, Frame, View, prior_between
 from .matching_run import match_pair
 from .methods import Method
@@ -62,7 +62,7 @@ def run_frames(
             counts: dict[str, Counts] = {}
             for m in scored:
                 counts[m.record.method] = counts.get(m.record.method, Counts()) + m.record.counts
-            book.see(frame.episode, counts, partial(page, name, frame, scored, teams))
+            book.see(frame.episode, counts, partial(page, name, frame, scored, teams), shared(frame))
     return records
 
 

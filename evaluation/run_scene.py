@@ -67,7 +67,7 @@ def run_episodes(
                     found += records(scene, frame, method)
                 if book is not None:
                     counts = {label: result.counts for label, result in frame.scores.items()}
-                    book.see(episode, counts, partial(page, scene, env, frame))
+                    book.see(episode, counts, partial(page, scene, env, frame), shared(env, frame))
         return found
     finally:
         env.close()
@@ -223,6 +223,13 @@ def occlusion(env: CollaborativeEnv) -> NDArray[np.float64]:
     # The cameras count objects from 0, `measure` counts the background as 0.
     seen = [measure(camera.instances + np.int32(1), camera.depth, m + 1) for camera in env.camera_frames()]
     return np.stack([row[1:, OCCLUSION] for row in seen])
+
+
+def shared(env: CollaborativeEnv, frame: SceneFrame) -> dict[int, NDArray[np.float64]]:
+    """True places (3,) m of the objects that the first two robots both detected."""
+    seen = set.intersection(*(set(identity(frame.views[i], i, env).tolist()) for i in (0, 1)))
+    places = zip(frame.truth.identity.tolist(), frame.truth.positions, strict=True)
+    return {name: place for name, place in places if name in seen}
 
 
 def page(scene: str, env: CollaborativeEnv, frame: SceneFrame) -> Page:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..pictures import Page, Result
+from ..pictures import MIN_FRAMES, MIN_PATH_M, Page, Result
 from .charts import path
 from .html import Child, Element, h, number
 from .run import Group
@@ -16,9 +16,6 @@ from .run import Group
 WIDTH, HEIGHT, MARGIN, BOTTOM = 360, 300, 14, 28
 """Below the map is room for its scale."""
 MAX_TRACKS = 3
-MIN_FRAMES = 3
-MIN_PATH_M = 0.2
-"""An object whose true path is shorter stands still."""
 SHOWN_FRAMES = 3
 """Instants of an episode at which Fig. 9 draws the matches."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ..pictures import Page
+from ..pictures import MIN_PATH_M, Page
 from . import topview
 from .curves import section
 from .html import Element, h
@@ -50,7 +50,8 @@ def figure_10(groups: Sequence[Group]) -> Element | None:
         f"Up to {topview.MAX_TRACKS} moving objects of an episode (objects that stand still, where none that moves was "
         "followed), in the frames in which the best method matched them rightly (the oracle, where it followed none): "
         "as one observer estimates them alone, and fused with the other. Thick line or ring: truth. Shown is the kept "
-        "episode in which objects are followed longest. The paper’s Fig. 10; its case study reports "
+        "episode in which objects are followed longest; of every unit of the run, the one with the longest shared "
+        "view of a moving object is kept. The paper’s Fig. 10; its case study reports "
         f"{single:.1f} mm alone and {fused:.1f} mm fused."
     )
     return section("trajectories", "Trajectories: truth, one robot, fused", note, panels)
@@ -60,7 +61,7 @@ def _tracks(group: Group) -> list[Element]:
     """One panel alone, one fused: by the best method if it followed something that moves, else by the oracle, else of
     what stands still."""
     entries = [group.best, *(e for e in group.entries if e.label == "oracle")]
-    for least_m in (topview.MIN_PATH_M, 0.0):
+    for least_m in (MIN_PATH_M, 0.0):
         for entry in entries:
             pages, found = topview.best_tracks(group, entry.label, least_m)
             if found:

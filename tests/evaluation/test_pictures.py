@@ -58,6 +58,25 @@ def test_the_rest_of_the_first_unit_is_followed_too_but_shows_no_images():
     assert other.pages() == []
 
 
+def follow(book, episode, *paths):
+    """One frame per place (m along x) of object 7; None where not both robots see it."""
+    for frame, x in enumerate(paths):
+        shared = {8: np.zeros(3)} | ({} if x is None else {7: np.array([x, 0.0, 0.0])})
+        book.see(episode, {"a": Counts(4, 4, 2)}, lambda frame=frame: make_page(10 * episode + frame), shared)
+
+
+def test_of_every_unit_the_longest_shared_view_of_something_that_moves_is_kept():
+    book = PictureBook(first_episode=0)
+    follow(book, 3, 0.0, 0.5, None, None, 1.0)
+    follow(book, 4, 0.0, 0.5, 1.0, None, 1.5)
+    follow(book, 5, 0.0, 0.01, 0.02, 0.03, 0.04)  # stands still, as object 8 does
+    assert [(p.frame, p.role) for p in book.pages()] == [(40 + k, "episode") for k in range(5)]
+    assert all(s.image is None for p in book.pages() for s in p.sights)
+    short = PictureBook(first_episode=0)
+    follow(short, 3, 0.0, 0.5)
+    assert short.pages() == []
+
+
 def test_pages_survive_parquet():
     pages = [make_page(0), make_page(1).without_images()]
     assert from_table(to_table(pages)) == pages
@@ -68,6 +87,8 @@ def test_a_run_on_a_dataset_writes_pages_that_agree_with_its_records(small_datas
     benchmark([str(small_dataset)], methods, Settings(), out=tmp_path / "run")
     pages = from_table(pq.read_table(tmp_path / "run" / "pictures" / "unit-00000.parquet"))
     records = records_from_table(pq.read_table(tmp_path / "run" / "records" / "unit-00000.parquet"))
+    fused = [np.array(r) - s.truth for p in pages for s, r in zip(p.sights, p.results[0].fused, strict=True)]
+    assert np.linalg.norm(np.concatenate(fused), axis=1).mean() < 0.15
     assert [p.frame for p in pages] == [0, 1, 2, 3, 4, 5]  # the first unit
     for page in pages:
         for result in page.results:
