@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,9 +49,15 @@ def check(folder: Path) -> Checked:
     dataset = load_dataset(folder)
     for _ in dataset:
         pass
-    size = read_meta(folder / HEAD)["image_size"]
+    for name in ("robots", "detections", "objects"):
+        _read_whole(folder / f"{name}.parquet")
+    head = read_meta(folder / HEAD)
+    size, classes = head["image_size"], head["classes"]
     _each_row(folder / "robots.parquet", ["image"], lambda row: _image_fault(row["image"], size))
     _each_row(folder / "objects.parquet", ["mask", "pixels"], lambda row: _mask_fault(row["mask"], row["pixels"], size))
+    _each_row(folder / "objects.parquet", ["class"], lambda row: _class_fault(row["class"], classes))
+    _each_row(folder / "objects.parquet", ["position"], lambda row: _vector_fault(row["position"], 3))
+    _each_row(folder / "objects.parquet", ["box"], lambda row: _vector_fault(row["box"], 4))
     _each_row(folder / "detections.parquet", ["mask"], lambda row: _mask_fault(row["mask"], None, size))
     return Checked(len(dataset), verified)
 
@@ -64,6 +71,14 @@ def _compare(folder: Path) -> None:
             raise ChecksumError(f"{file} differs from its checksum")
 
 
+def _read_whole(file: Path) -> None:
+    """Also the columns that no reader of ours needs. Raises DatasetError for the first that cannot be read."""
+    if file.exists():
+        for name in dict.fromkeys(pq.read_schema(file).names):
+            for _ in _batches(file, [name]):
+                pass
+
+
 def _each_row(file: Path, columns: list[str], fault: Callable[[dict[str, Any]], str | None]) -> None:
     """Raise for the first row with a fault; a file without these columns has none. The first column is to blame."""
     for number, row in enumerate(_rows(file, columns)):
@@ -72,16 +87,28 @@ def _each_row(file: Path, columns: list[str], fault: Callable[[dict[str, Any]], 
 
 
 def _rows(file: Path, columns: list[str]) -> Iterator[dict[str, Any]]:
-    if not file.exists():
-        return
-    table = pq.ParquetFile(file, page_checksum_verification=True)
-    if not set(columns) <= set(table.schema_arrow.names):
-        return
-    try:
-        for batch in table.iter_batches(ROWS_AT_ONCE, columns=columns):
+    if file.exists() and set(columns) <= set(pq.read_schema(file).names):
+        for batch in _batches(file, columns):
             yield from batch.to_pylist()
+
+
+def _batches(file: Path, columns: list[str]) -> Iterator[pa.RecordBatch]:
+    table = pq.ParquetFile(file, page_checksum_verification=True)
+    try:
+        yield from table.iter_batches(ROWS_AT_ONCE, columns=columns)
     except (pa.ArrowException, OSError) as error:
         raise DatasetError(f"{file}: column {columns[0]!r} cannot be read (corrupt?): {error}") from error
+
+
+def _class_fault(name: Any, classes: tuple[str, ...]) -> str | None:
+    return None if name is None or name in classes else f"{name!r} is none of the classes {', '.join(classes)}"
+
+
+def _vector_fault(values: Any, length: int) -> str | None:
+    if values is None:
+        return None
+    numbers = isinstance(values, list) and all(isinstance(x, int | float) and math.isfinite(x) for x in values)
+    return None if numbers and len(values) == length else f"{values!r} is not {length} finite numbers"
 
 
 def _image_fault(image: Any, size: tuple[int, int] | None) -> str | None:

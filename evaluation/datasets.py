@@ -20,6 +20,8 @@ from ..matching import ObjectGraph, RelativePose
 from ..matching.pose import Array, invert
 from .dataset_tables import DatasetError, bad_row, read_detections, read_meta, read_objects, read_robots
 
+UNFINISHED = "recording.json"
+"""A file of folders that `covis record` has not finished."""
 POSE_FLOOR_STD_M = 1e-3
 """Least standard deviation of a pose's translation, m."""
 POSE_FLOOR_STD_RAD = 1e-3
@@ -196,6 +198,8 @@ def load_dataset(path: str | Path, seed: int = 0) -> Dataset:
     path = Path(path)
     if not path.is_dir():
         raise DatasetError(f"{path} is not a folder")
+    if (path / UNFINISHED).exists() and not (path / "dataset.json").exists():
+        raise DatasetError(f"{path} is an unfinished recording: go on with covis record --resume")
     meta = read_meta(path / "dataset.json")
     robots = read_robots(path / "robots.parquet")
     detections = read_detections(path / "detections.parquet", len(meta["classes"]), meta["image_size"])

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from .data_card import card
 from .dataset_tables import FORMAT, VERSION
+from .datasets import UNFINISHED
 from .engine import make_executor
 from .executors import Done, Executor, Failure
 from .settings import Settings, scene_preset
@@ -75,7 +76,7 @@ OBJECTS = pa.schema(
 )
 TABLES = {"robots": ROBOTS, "detections": DETECTIONS, "objects": OBJECTS}
 CHECKSUMS = "checksums.json"
-REQUEST = "recording.json"
+REQUEST = UNFINISHED
 HEAD = "dataset.json"
 FILES = (HEAD, CHECKSUMS, "README.md", *(f"{table}.parquet" for table in TABLES))
 FRAMES_PER_EPISODE_NUMBER = 1000

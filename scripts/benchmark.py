@@ -17,7 +17,7 @@ from ..evaluation.extras import require
 from ..evaluation.methods import Method
 from ..evaluation.settings import Settings
 from ..evaluation.suites import SUITES
-from .console import err, fail, out, progress_bar, write_rows
+from .console import err, fail, out, progress_bar, require_writable, require_writable_figure, write_rows
 
 
 def benchmark(
@@ -61,8 +61,10 @@ def benchmark(
             raise ValueError(f"{'--resume' if resume else '--overwrite'} needs --out")
         if resume and overwrite:
             raise ValueError("give --resume or --overwrite, not both")
+        require_writable(json_target)
         if figure is not None:
             require("viz")
+            require_writable_figure(figure)
         with progress_bar("benchmark") as progress:
             how |= {"progress": progress, "judge": verdicts.extend}
             rows = _run(targets, method or [], _only(given), _only(changes), how)
@@ -125,6 +127,7 @@ def _perception(
         if targets != ["perception"]:
             raise ValueError(f"perception is benchmarked alone, got the targets {' '.join(targets)}")
         weights = weights_of(eyes)
+        require_writable(json_target)
         with progress_bar("perception") as progress:
             rows = perception_benchmark(weights=weights, images=images or IMAGES, seed=seed, progress=progress)
         if figure is not None:

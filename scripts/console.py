@@ -32,6 +32,28 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int], None]]:
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
+def require_writable(*files: str | Path | None) -> None:
+    """What a long run will be written to at its end is found out at its beginning; None and `-` are no files.
+
+    Raises:
+        OSError: a folder in a file's place, or no folder to put it into.
+    """
+    for file in (Path(f) for f in files if f is not None and str(f) != "-"):
+        if file.is_dir():
+            raise IsADirectoryError(f"{file} is a folder, not a file to write to")
+        if not file.absolute().parent.is_dir():
+            raise FileNotFoundError(f"there is no folder {file.parent} to write {file.name} into")
+
+
+def require_writable_figure(file: Path) -> None:
+    """A folder for it is made where there is none. Raises ValueError for a kind of picture that cannot be drawn."""
+    from matplotlib.backend_bases import FigureCanvasBase
+
+    kinds = FigureCanvasBase.get_supported_filetypes()
+    if file.suffix.removeprefix(".") not in kinds:
+        raise ValueError(f"a figure is written as .{', .'.join(sorted(kinds))}, not as {file.name!r}")
+
+
 def write_rows(rows: Sequence[dict[str, Any]], json_target: str | None) -> None:
     """`{"rows": [...]}` to a file, or to standard output for `-`."""
     if json_target is None:

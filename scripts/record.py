@@ -29,6 +29,8 @@ def record(
 ) -> None:
     """Record episodes of a scene in the dataset format, with images, masks, poses and truth."""
     try:
+        if resume and overwrite:
+            raise ValueError("give --resume or --overwrite, not both")
         require_scene(perception)
         settings = Settings(preset=preset, seed=seed, episodes=episodes, perception=perception)
         with progress_bar(f"record {scene}") as progress:

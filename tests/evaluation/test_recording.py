@@ -240,3 +240,28 @@ def test_check_looks_at_images_and_masks(recorded, tmp_path):
     assert "column 'mask', row 3: runs of" in spoil("objects", "mask", lambda runs: runs[:-1])
     assert "column 'mask', row 3: a mask of 76800 pixels" in spoil("objects", "mask", lambda _: [0, 76800])
     assert "column 'mask', row 3: not run lengths" in spoil("objects", "mask", lambda runs: [-1, *runs])
+    assert "column 'class', row 3: 'zebra' is none of the classes red, blue" in spoil(
+        "objects", "class", lambda _: "zebra"
+    )
+    assert "'position', row 3: [nan, 0.0, 0.0] is not 3" in spoil("objects", "position", lambda _: [np.nan, 0.0, 0.0])
+    assert "column 'box', row 3: [1.0, 2.0] is not 4 finite" in spoil("objects", "box", lambda _: [1.0, 2.0])
+
+
+def test_check_finds_a_flipped_bit_in_any_column(recorded, tmp_path):
+    """Without checksums.json: recorded files carry a checksum in every page of every column."""
+    folder = tmp_path / "copy"
+    shutil.copytree(recorded, folder)
+    (folder / "checksums.json").unlink()
+    for table in recording.TABLES:
+        file = folder / f"{table}.parquet"
+        whole = file.read_bytes()
+        meta = pq.read_metadata(file).row_group(0)
+        for number in range(meta.num_columns):
+            column = meta.column(number)
+            start = column.dictionary_page_offset or column.data_page_offset
+            spoilt = bytearray(whole)
+            spoilt[start + column.total_compressed_size - 2] ^= 0x10  # in its last page's values
+            file.write_bytes(bytes(spoilt))
+            with pytest.raises(DatasetError, match=f"{table}.parquet"):
+                check(folder)
+        file.write_bytes(whole)

@@ -49,6 +49,9 @@ def test_benchmark_writes_a_file_and_a_table(small_dataset, tmp_path):
         (["--method", "reid:colour=3"], "colour"),
         (["--pose", "maybe"], "pose must be one of"),
         (["--resume"], "--resume needs --out"),
+        (["--json", "nowhere/rows.json"], "there is no folder nowhere to write rows.json into"),
+        (["--json", "."], "is a folder, not a file"),
+        (["--figure", "figure.gift"], "not as 'figure.gift'"),
         (["--method", "reid", "--workers", "0"], "workers must be at least 1, got 0"),
     ],
 )

@@ -57,6 +57,18 @@ def test_a_file_in_the_place_of_the_folder_is_said(tmp_path):
     assert "file" in said
 
 
+def test_unfinished_recordings_are_not_benchmarked(small_dataset):
+    (small_dataset / "dataset.json").rename(small_dataset / "recording.json")
+    code, said = covis("benchmark", small_dataset, "--method", "reid")
+    assert code == 2
+    assert "is an unfinished recording: go on with covis record --resume" in said
+
+
+def test_resume_and_overwrite_exclude_each_other(tmp_path):
+    code, said = covis(*RECORD, 1, "--out", tmp_path / "boxes", "--resume", "--overwrite")
+    assert (code, said) == (2, "covis: give --resume or --overwrite, not both\n")
+
+
 def test_ctrl_c_says_what_is_kept(tmp_path):
     folder = tmp_path / "boxes"
     process = subprocess.Popen(
