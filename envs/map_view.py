@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -13,11 +12,9 @@ from numpy.typing import NDArray
 from ..matching.pose import transform
 from .camera.raster import Look, Rasterizer
 from .colors import FAINT, INK, PLATE, WRONG, Color, class_color, identity_colors, robot_color
+from .instant import Answered
 from .paint import Array, Image, blend, cross, disc, polygon, polyline, round_length, rounded, text, text_width
 from .worlds.world import Light, Mesh, Snapshot
-
-if TYPE_CHECKING:
-    from .collaborative import Answered
 
 FROM_ABOVE = Look(clouds=0.0, haze_m=1e9, samples=2)
 LAMP = Light(sun_direction=(-0.45, 0.5, 0.74), ambient=0.62)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from .claims import Claims
 from .colors import CANVAS, FAINT, IDENTITY_COLORS, INK, RIGHT, WRONG, Color, identity_colors, robot_color
+from .instant import Answered, Instant
 from .map_view import MapPainter, area_of, matched_identities
 from .paint import (
     GAP,
@@ -30,22 +31,34 @@ from .paint import (
     text_width,
 )
 from .scoring import StepScore
-
-if TYPE_CHECKING:
-    from .collaborative import Answered, CollaborativeEnv, Instant
+from .worlds.world import World
 
 HEIGHT = 728
 """Pixels of the map's side and of the stacked cameras."""
 HEAD = 44
 
 
+class Watched(Protocol):
+    """What a picture needs of an environment; see `CollaborativeEnv`."""
+
+    name: str
+    world: World
+    classes: tuple[str, ...]
+
+    def answered(self) -> Answered | None: ...
+
+    def now(self) -> Instant: ...
+
+    def trail(self) -> Array: ...
+
+
 class ScenePainter:
     """Draws one environment; keeps memory from picture to picture."""
 
-    def __init__(self, env: CollaborativeEnv) -> None:
+    def __init__(self, env: Watched) -> None:
         self._map = MapPainter(env.world.meshes, HEIGHT)
 
-    def compose(self, env: CollaborativeEnv) -> Image:
+    def compose(self, env: Watched) -> Image:
         """Every camera on the left, the scene from above on the right, the figures of the last step over them.
 
         After a step with claims the picture shows the instant they are about, else the present one. Boxes in a vivid
@@ -68,7 +81,7 @@ class ScenePainter:
         return _framed(np.concatenate([head, body]))
 
 
-def compose(env: CollaborativeEnv) -> Image:
+def compose(env: Watched) -> Image:
     """The picture of `ScenePainter`, once."""
     return ScenePainter(env).compose(env)
 

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from .layout import in_disc
-from .robots import Range, RobotSceneParams, RobotWorld, Scene, State, camera_mount, planar_poses, require
+from .robot_params import Range, RobotSceneParams, require
+from .robots import RobotWorld, Scene, State, camera_mount, planar_poses
 from .world import Array
 
 GRAVITY = 9.81

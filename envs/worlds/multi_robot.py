@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 
-from .robots import RobotSceneParams, RobotWorld
+from .robot_params import RobotSceneParams
+from .robots import RobotWorld
 
 
 @dataclass(frozen=True, kw_only=True)

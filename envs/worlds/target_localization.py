@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 
-from .robots import Range, RobotSceneParams, RobotWorld
+from .robot_params import Range, RobotSceneParams
+from .robots import RobotWorld
 
 SCALE = 0.36
 """A robot of 35 cm."""

@@ -305,6 +305,10 @@ def test_impossible_numbers_of_observers(bad: object) -> None:
     [
         ({"n_team": -1}, "n_team.*-1"),
         ({"n_team": 400}, "n_team.*400"),
+        ({"n_team": 2.5}, "n_team.*2.5"),
+        ({"n_team": "5"}, "n_team.*'5'"),
+        ({"n_obstacles": (1.5, 2)}, "n_obstacles.*1.5"),
+        ({"team_radius_m": 5.0}, "team_radius_m.*5.0"),
         ({"n_obstacles": (-1, 2)}, "n_obstacles.*-1"),
         ({"n_obstacles": (4, 2)}, "n_obstacles"),
         ({"scale": -1.0}, "scale.*-1"),
