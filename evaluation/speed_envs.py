@@ -128,6 +128,7 @@ def connected_driving() -> dict[str, Any]:
     """Whole steps on the intersection with two 320x240 cameras, against bare highway-env's Kinematics observation.
 
     Episode by episode, so that both sides have the same traffic: a twin of the scene at its reset, then as many steps.
+    How the vehicles' controls are found counts on neither side: the peer's are idle.
     """
     from ..envs.worlds.highway_peer import bare_intersection
 
@@ -141,16 +142,19 @@ def connected_driving() -> dict[str, Any]:
             env.reset(seed=seed)
             peer, idle = bare_intersection(world)
             vehicles.append(len(world.traffic()))
-            steps, start = 0, perf_counter()
+            steps, seconds = 0, 0.0
             while env.agents:
                 controls = scripted_controls(world)
-                env.step({a: claims_to_action(nothing, controls[i]) for i, a in enumerate(env.agents)})
+                actions = {a: claims_to_action(nothing, controls[i]) for i, a in enumerate(env.agents)}
+                start = perf_counter()
+                env.step(actions)
+                seconds += perf_counter() - start
                 steps += 1
-            middle = perf_counter()
+            start = perf_counter()
             for _ in range(steps):
                 peer.step(idle)
-            mine.append(steps / (middle - start))
-            theirs.append(steps / (perf_counter() - middle))
+            mine.append(steps / seconds)
+            theirs.append(steps / (perf_counter() - start))
             peer.close()
     finally:
         env.close()
