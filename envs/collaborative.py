@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -24,37 +24,20 @@ from .camera.mount import Mount, checked_mounts, kept_picture, with_mounts
 from .camera.raster import Look, intrinsics_from_fov
 from .camera.rig import CameraRig, Exposures
 from .claims import Claims, action_space, decode
+from .figures import N_SUMS, figures, sums
+from .instant import Answered, Instant
+from .observations import SENSORS, message_leaves, observation_space
 from .scoring import LocalizationReward, Reward, StepScore, Truth, score, tight_boxes
 from .seeding import EpisodeSeeds, Seed
 from .sensing import MAX_DEPTH_M, PoseNoise, permuted_instances, up_in_camera
 from .worlds.world import Snapshot, World
-
-SENSORS = ("image", "depth", "instances")
-
-
-@dataclass(frozen=True, eq=False)
-class Instant:
-    """One instant of the world: what is there, what the cameras see, what is true."""
-
-    snapshot: Snapshot
-    frames: tuple[CameraFrame, ...]
-    truth: Truth
-
-
-@dataclass(frozen=True, eq=False)
-class Answered:
-    """Claims of all robots, the instant they are about, and their scores."""
-
-    instant: Instant
-    claims: tuple[Claims, ...]
-    score: StepScore
 
 
 @dataclass(eq=False)
 class _Episode:
     """Everything of the environment itself that changes; a deep copy of it is its saved state.
 
-    `sums` and `totals` (N, N_SUMS) are those of the last step and of the episode, see `_sums`; `trail` holds the
+    `sums` and `totals` (N, N_SUMS) are those of the last step and of the episode, see `figures.sums`; `trail` holds the
     cameras' places (N, 2) at each instant, m.
     """
 
@@ -117,6 +100,7 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
 
     Raises:
         ValueError: a size, sensor or mode that does not exist; a world with a single robot; mounts for other robots.
+        TypeError: pose noise, a reward, a look, effects or a mount that is something else.
     """
 
     def __init__(
@@ -168,9 +152,18 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
             ("min_pixels", min_pixels, 1),
         ):
             if not isinstance(value, (int, np.integer)) or value < least:
-                raise ValueError(f"{label} must be a whole number >= {least}, got {value}")
-        if isinstance(sensors, str):
-            raise ValueError(f"sensors must be a sequence of names, got the string {sensors!r}")
+                raise ValueError(f"{label} must be a whole number >= {least}, got {value!r}")
+        for label, given, kind in (
+            ("pose_noise", pose_noise, PoseNoise),
+            ("look", look, Look),
+            ("effects", effects, EffectRanges),
+        ):
+            if given is not None and not isinstance(given, kind):
+                raise TypeError(f"{label} must be a {kind.__name__} or None, got {given!r}")
+        if reward is not None and not callable(reward):
+            raise TypeError(f"reward must be a function of a StepScore, or None, got {reward!r}")
+        if isinstance(sensors, str) or not isinstance(sensors, Sequence):
+            raise ValueError(f"sensors must be a sequence of names, got {sensors!r}")
         unknown = [s for s in sensors if s not in SENSORS]
         if unknown:
             raise ValueError(f"unknown sensor {unknown[0]!r}; there are {', '.join(SENSORS)}")
@@ -222,7 +215,9 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         self._episode: _Episode | None = None
         space = action_space(self.world.control_size, self.max_detections, n - 1, self.width, self.height)
         self.action_spaces = dict.fromkeys(self.possible_agents, space)
-        observation = self._make_observation_space()
+        observation = observation_space(
+            self.world, self.width, self.height, self.max_detections, self.sensors, messages=self.messages
+        )
         self.observation_spaces = dict.fromkeys(self.possible_agents, observation)
         self.state_space = spaces.Box(-np.inf, np.inf, (self._state_size(),), np.float64)
 
@@ -233,36 +228,6 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
 
     def action_space(self, agent: str) -> spaces.Space:
         return self.action_spaces[agent]
-
-    def _make_observation_space(self) -> spaces.Dict:
-        inf = np.inf
-        leaves: dict[str, spaces.Space] = {}
-        if "image" in self.sensors:
-            leaves["image"] = spaces.Box(0, 255, (self.height, self.width, 3), np.uint8)
-        leaves |= {
-            "intrinsics": spaces.Box(-inf, inf, (3, 3), np.float32),
-            "pose": spaces.Box(-inf, inf, (4, 4), np.float32),
-            "pose_covariance": spaces.Box(-inf, inf, (6, 6), np.float32),
-            "up": spaces.Box(-1.01, 1.01, (3,), np.float32),
-            "odometry": spaces.Box(-inf, inf, (4, 4), np.float32),
-            "state": spaces.Box(-inf, inf, (self.world.state_size,), np.float32),
-        }
-        if "depth" in self.sensors:
-            leaves["depth"] = spaces.Box(0, MAX_DEPTH_M, (self.height, self.width), np.float32)
-        if "instances" in self.sensors:
-            m = self.world.max_objects
-            leaves["instances"] = spaces.Box(0, m, (self.height, self.width), np.int32)
-            leaves["instance_classes"] = spaces.Box(-1, len(self.classes) - 1, (m + 1,), np.int64)
-        if self.messages:
-            partners, K = self.world.n_robots - 1, self.max_detections
-            leaves |= {
-                "message_boxes": spaces.Box(0, inf, (partners, K, 4), np.float32),
-                "message_positions": spaces.Box(-inf, inf, (partners, K, 3), np.float32),
-                "message_position_variance": spaces.Box(0, inf, (partners, K), np.float32),
-                "message_matches": spaces.Box(0, K, (partners, partners, K), np.int64),
-                "message_match_scores": spaces.Box(0, 1, (partners, partners, K), np.float32),
-            }
-        return spaces.Dict(leaves)
 
     # The episode
 
@@ -278,8 +243,10 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
                 ignored with a warning.
 
         Raises:
-            ValueError: not a seed; both a seed and a state.
+            ValueError: not a seed; both a seed and a state; options that are no dict.
         """
+        if not isinstance(options, Mapping | None):
+            raise ValueError(f"options must be a dict or None, got {options!r}")
         options = dict(options or {})
         saved = options.pop("state", None)
         if options:
@@ -326,6 +293,8 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         agents = self.agents
         if not agents:
             raise RuntimeError("the episode is over: call reset()")
+        if not isinstance(actions, Mapping):
+            raise ValueError(f"actions must be a dict by agent, got {type(actions).__name__}")
         missing = [a for a in agents if a not in actions]
         if missing:
             raise ValueError(f"{missing[0]}: no action given")
@@ -335,7 +304,7 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         decoded = [decode(a, actions[a], self.action_spaces[a]) for a in agents]
         episode.claims = [claims for _, claims in decoded]
         episode.score = score(episode.claims, episode.now.truth)
-        episode.sums = _sums(episode.score)
+        episode.sums = sums(episode.score)
         episode.totals = episode.totals + episode.sums
         reward = float(self.reward(episode.score))
         self.world.step(np.stack([control for control, _ in decoded]))
@@ -456,19 +425,8 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
                 frame.instances, snapshot.object_class, self.world.max_objects, episode.id_rng
             )
         if self.messages:
-            out |= self._messages(i, episode.claims)
+            out |= message_leaves(i, episode.claims)
         return out
-
-    @staticmethod
-    def _messages(i: int, claims: Sequence[Claims]) -> dict[str, NDArray[Any]]:
-        partners = [c for j, c in enumerate(claims) if j != i]
-        return {
-            "message_boxes": np.stack([c.boxes for c in partners]).astype(np.float32),
-            "message_positions": np.stack([c.positions for c in partners]).astype(np.float32),
-            "message_position_variance": np.stack([c.position_variance for c in partners]).astype(np.float32),
-            "message_matches": np.stack([c.matches for c in partners]),
-            "message_match_scores": np.stack([c.match_scores for c in partners]).astype(np.float32),
-        }
 
     def _infos(self, episode: _Episode) -> dict[str, dict[str, float]]:
         """Figures of the last step's claims, and `episode_*` over the episode so far.
@@ -479,8 +437,8 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         collided = episode.now.snapshot.collided
         return {
             agent: {
-                **_figures(episode.sums[i], ""),
-                **_figures(episode.totals[i], "episode_"),
+                **figures(episode.sums[i], ""),
+                **figures(episode.totals[i], "episode_"),
                 "collided": float(collided[i]),
             }
             for i, agent in enumerate(self.possible_agents)
@@ -570,36 +528,3 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         if self._window is not None:
             self._window.close()
             self._window = None
-
-
-N_SUMS = 7
-
-
-def _sums(result: StepScore) -> NDArray[np.float64]:
-    """Per robot (N, 7): the team's correct, retrieved, covisible, visible; own single and fused error (m), number."""
-    counts = result.counts
-    team = (counts.correct, counts.retrieved, counts.common, result.n_visible)
-    out = np.zeros((len(result.tied), N_SUMS))
-    out[:, :4] = team
-    if counts.correct:
-        localized = ~np.isnan(result.error_single)
-        out[:, 4] = np.where(localized, result.error_single, 0.0).sum(axis=1)
-        out[:, 5] = np.where(localized, result.error_fused, 0.0).sum(axis=1)
-        out[:, 6] = localized.sum(axis=1)
-    return out
-
-
-def _figures(sums: NDArray[np.float64], prefix: str) -> dict[str, float]:
-    correct, retrieved, common, visible, single, fused, localized = sums
-    return {
-        f"{prefix}n_correct": float(correct),
-        f"{prefix}n_retrieved": float(retrieved),
-        f"{prefix}n_covisible": float(common),
-        f"{prefix}n_visible": float(visible),
-        f"{prefix}precision": float(correct / retrieved) if retrieved else 0.0,
-        f"{prefix}recall": float(correct / common) if common else 0.0,
-        f"{prefix}scene_recall": float(correct / visible) if visible else 0.0,
-        f"{prefix}n_localized": float(localized),
-        f"{prefix}displacement_single_m": float(single / localized) if localized else 0.0,
-        f"{prefix}displacement_fused_m": float(fused / localized) if localized else 0.0,
-    }

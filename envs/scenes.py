@@ -107,6 +107,8 @@ def _own_scene(
         raise ValueError(f"no World at {path!r}: {error}") from error
     if preset is not None:
         raise ValueError(f"{path!r} has no presets, got preset={preset!r}; give params")
+    if not callable(world):
+        raise ValueError(f"{path!r} is not a World nor anything that makes one, but {world!r}")
     arguments = [a for a in (n_robots, params) if a is not None]
     return CollaborativeEnv(partial(world, *arguments), **({"name": attribute} | options))
 

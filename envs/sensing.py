@@ -33,8 +33,8 @@ class PoseNoise:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not (np.isfinite(value) and value >= 0):
-                raise ValueError(f"PoseNoise.{name} must be finite and non-negative, got {value}")
+            if not (isinstance(value, int | float | np.number) and np.isfinite(value) and value >= 0):
+                raise ValueError(f"PoseNoise.{name} must be finite and non-negative, got {value!r}")
 
     def covariance(self, up: Array) -> Array:
         """Covariance (6, 6) of the reported pose, right perturbation; `up` (3,) in the camera frame."""

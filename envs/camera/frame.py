@@ -70,6 +70,8 @@ class FrameMemory(Memory):
 
     def frame(self) -> Frame:
         """Arrays to render into, contents undefined."""
+        if 4 * self.width * self.height < SMALL:
+            return Frame.empty(self.width, self.height)
         flat, pixels, shape = self.take(), self.width * self.height, (self.height, self.width)
         return Frame(
             flat[8 * pixels :].reshape(*shape, 3),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -24,7 +24,8 @@ class Mount:
         own_body: whether it sees the robot it sits on, which then is an object of its picture like any other.
 
     Raises:
-        ValueError: a field of view outside (0, pi), a tilt beyond straight down or up, a rate that is not positive.
+        ValueError: a value that is not finite, a field of view outside (0, pi), a tilt beyond straight down or up, a
+            rate that is not positive.
     """
 
     forward_m: float = 0.0
@@ -37,6 +38,10 @@ class Mount:
     own_body: bool = False
 
     def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not (isinstance(value, int | float | np.number) and np.isfinite(value)) and value is not None:
+                raise ValueError(f"{field.name} must be a finite number, got {value!r}")
         if not 0 < self.horizontal_fov_rad < np.pi:
             raise ValueError(f"horizontal_fov_rad must be in (0, pi), got {self.horizontal_fov_rad}")
         if not abs(self.tilt_rad) <= np.pi / 2:
@@ -76,8 +81,8 @@ def checked_mounts(mounts: Sequence[Mount | None] | None, n_robots: int) -> tupl
     """
     if mounts is None:
         return (None,) * n_robots
-    if len(mounts) != n_robots:
-        raise ValueError(f"mounts must hold one Mount or None per robot, {n_robots} of them, got {len(mounts)}")
+    if not isinstance(mounts, Sequence) or len(mounts) != n_robots:
+        raise ValueError(f"mounts must hold one Mount or None per robot, {n_robots} of them, got {mounts!r}")
     for i, mount in enumerate(mounts):
         if mount is not None and not isinstance(mount, Mount):
             raise TypeError(f"mounts[{i}] must be a Mount or None, got {type(mount).__name__}")

@@ -62,6 +62,9 @@ class Look:
     samples: int = 1
 
     def __post_init__(self) -> None:
+        for name in ("contact", "clouds", "haze_m"):
+            if not isinstance(getattr(self, name), int | float | np.number):
+                raise ValueError(f"{name} must be a number, got {getattr(self, name)!r}")
         for name in ("contact", "clouds"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)}")
@@ -353,12 +356,16 @@ def _camera_row(T_world_camera: Array, intrinsics: Array, sample_offset: tuple[f
     K = np.asarray(intrinsics, dtype=np.float64)
     if T.shape != (4, 4):
         raise ValueError(f"T_world_camera must have shape (4, 4), got {T.shape}")
-    if K.shape != (3, 3) or not (K[0, 0] > 0 and K[1, 1] > 0 and K[0, 1] == K[1, 0] == 0 and K[2, 2] == 1):
+    ok = K.shape == (3, 3)
+    if ok:
+        (fx, skew, cx), (zero, fy, cy), (_, _, one) = K.tolist()
+        ok = fx > 0 and fy > 0 and skew == zero == 0 and one == 1
+    if not ok:
         raise ValueError(f"intrinsics must be a pinhole matrix (3, 3) without skew, got\n{K}")
     row = np.empty(19)
     row[:9] = T[:3, :3].ravel()
     row[9:12] = T[:3, 3]
-    row[12:] = K[0, 0], K[1, 1], K[0, 2], K[1, 2], *sample_offset, near_m
+    row[12:] = fx, fy, cx, cy, *sample_offset, near_m
     if not isfinite(row.sum()):
         raise ValueError(f"T_world_camera and intrinsics must be finite, got\n{T}\n{K}")
     return row

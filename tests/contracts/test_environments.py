@@ -422,10 +422,16 @@ def test_a_reward_of_ones_own(name):
         ("sensors", "image"),
         ("render_mode", "ascii"),
         ("seed", -1),
+        ("sensors", None),
+        ("pose_noise", 0.3),
+        ("reward", 5),
+        ("look", "pretty"),
+        ("effects", "some"),
+        ("mounts", 5),
     ],
 )
 def test_bad_arguments_are_named(name, option, value):
-    with pytest.raises(ValueError, match=option.rstrip("s")):
+    with pytest.raises((ValueError, TypeError), match=option.rstrip("s")):
         make(name, **{option: value})
 
 

@@ -127,7 +127,8 @@ def test_a_slow_camera_keeps_its_picture_and_the_truth_goes_with_it():
 @pytest.mark.parametrize(
     ("mounts", "error", "message"),
     [
-        ((None,), ValueError, "one Mount or None per robot, 2 of them, got 1"),
+        ((None,), ValueError, r"one Mount or None per robot, 2 of them, got \(None,\)"),
+        (5, ValueError, "one Mount or None per robot, 2 of them, got 5"),
         ((None, 1.0), TypeError, r"mounts\[1\] must be a Mount"),
     ],
 )
@@ -158,3 +159,9 @@ def test_a_camera_sees_its_own_robot_only_if_mounted_so():
         assert truth.pixels[0, own[0]] == 0
         assert truth.pixels[1, own[1]] > 50
         env.close()
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), "2"])
+def test_a_mount_takes_finite_numbers(value):
+    with pytest.raises(ValueError, match="height_m must be a finite number"):
+        Mount(height_m=value)

@@ -1,5 +1,7 @@
 """Scenes by name, by path, and in PettingZoo's registry."""
 
+from pathlib import Path
+
 import pytest
 
 from covis.envs.scenes import SCENES, parallel_env
@@ -61,3 +63,14 @@ def test_parameters_of_something_else_are_refused(scene):
 def test_a_number_of_robots_that_does_not_fit_is_named(scene, n_robots):
     with pytest.raises(ValueError, match=f"got {n_robots}"):
         parallel_env(scene, n_robots=n_robots)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_the_scenes_page_tells_its_spaces(scene):
+    page = (Path(__file__).parents[2] / "docs" / "reference" / "scenes" / f"{scene}.md").read_text()
+    env = parallel_env(scene)
+    action, observation = env.action_space("robot_0"), env.observation_space("robot_0")
+    for space in (action, observation):
+        for name, leaf in space.spaces.items():
+            assert f"`{name}` {leaf.shape}" in page
+    assert f"| `state()` | {env.state_space.shape}: up to {env.world.max_objects} objects" in page
