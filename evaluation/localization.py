@@ -57,7 +57,7 @@ class Motion:
 
 MOTIONS = {
     "target_localization": Motion(TrackerOptions(acceleration_std=0.5, initial_speed_std=0.3)),
-    "multi_robot": Motion(TrackerOptions(acceleration_std=0.7, initial_speed_std=0.3), repeated=0.05),
+    "multi_robot": Motion(TrackerOptions(acceleration_std=0.7, initial_speed_std=0.3, gate=12.0), repeated=0.05),
     "aerial_ground": Motion(TrackerOptions(acceleration_std=1.0, initial_speed_std=0.7), repeated=0.1),
     "connected_driving": Motion(TrackerOptions(acceleration_std=2.0, initial_speed_std=8.0), repeated=0.3),
 }
@@ -341,7 +341,7 @@ def _team_errors(step: Instant, matchings: dict[tuple[int, int], Matching], team
     poses = {(me, k): _relative(step, robot, r) for k, r in enumerate(team) if r != robot}
     groups = consistent(_within(matchings, team), [len(g) for g in graphs])
     covariance = step.views[robot].pose_covariance
-    own = fuse_own(graphs, poses, groups, me, gate=GATE, frame_covariance=covariance)
+    own = fuse_own(graphs, poses, groups, me, gate=GATE, trust_own=True, frame_covariance=covariance)
     true = step.identity[robot] >= 0
     error = (own.positions - step.truth[robot])[true]
     single = np.linalg.norm((own.positions_single - step.truth[robot])[true], axis=1)

@@ -25,6 +25,7 @@ def fuse(
     frame: int = 0,
     gain: Gain = "covariance",
     gate: float | None = None,
+    trust_own: bool = False,
     frame_covariance: Array | None = None,
 ) -> FusedObjects:
     """Fused objects of N robots in the sensor frame of robot `frame`.
@@ -37,6 +38,8 @@ def fuse(
         gain: "covariance", "joint" or "paper".
         gate: share of honest measurements to keep, for example 0.999; what disagrees more with the rest of its group is
             left out (`used`), so that a robot that is wrong does not drag the estimate. None = keep all.
+        trust_own: what disagrees with the frame robot's own measurement is left out, instead of what disagrees with
+            most of the group: right where a wrong match is likelier than an own measurement that is wrong.
         frame_covariance: covariance (6, 6) of the frame robot's own pose in the world, where all the relative poses
             rest on it: the partners then share its error, and `gain="covariance"` counts it once. None = independent.
 
@@ -52,8 +55,17 @@ def fuse(
         # Poses between partners often rest on the same errors, one world pose per robot: only the frame's own count.
         partners = [j for j in range(len(graphs)) if j != frame]
         star = {(frame, j): pose for j in partners if (pose := relative_pose(poses, frame, j)) is not None}
-        return refine(graphs, star, groups, frame=frame, gate=gate).objects
-    return fuse_given(graphs, poses, groups, frame=frame, gain=gain, gate=gate, frame_covariance=frame_covariance)
+        return refine(graphs, star, groups, frame=frame, gate=gate, trust_own=trust_own).objects
+    return fuse_given(
+        graphs,
+        poses,
+        groups,
+        frame=frame,
+        gain=gain,
+        gate=gate,
+        trust_own=trust_own,
+        frame_covariance=frame_covariance,
+    )
 
 
 def fuse_own(
@@ -64,10 +76,20 @@ def fuse_own(
     *,
     gain: Gain = "covariance",
     gate: float | None = None,
+    trust_own: bool = False,
     frame_covariance: Array | None = None,
 ) -> OwnObjects:
     """Every detection of `robot`, fused with what its partners measured; arguments as in `fuse`."""
-    fused = fuse(graphs, poses, matchings, frame=robot, gain=gain, gate=gate, frame_covariance=frame_covariance)
+    fused = fuse(
+        graphs,
+        poses,
+        matchings,
+        frame=robot,
+        gain=gain,
+        gate=gate,
+        trust_own=trust_own,
+        frame_covariance=frame_covariance,
+    )
     return own_objects(graphs, fused, gain=gain)
 
 

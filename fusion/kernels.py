@@ -79,11 +79,12 @@ def _invert_information(A: Array, out: Array) -> None:
 
 
 @njit(cache=True)
-def gate_groups(rows: NDArray[np.int64], positions: Array, covariances: Array, threshold: float) -> None:
+def gate_groups(rows: NDArray[np.int64], positions: Array, covariances: Array, threshold: float, trusted: int) -> None:
     """Set to -1, in place, the members of each group that disagree with its largest consistent core.
 
     The core is the member that most others agree with (by the threshold on the squared Mahalanobis distance of their
-    difference), and those others; among equals the more precise. Of two that disagree the more precise is kept.
+    difference), and those others; among equals the more precise. Of two that disagree the more precise is kept. In
+    groups that robot `trusted` (column, -1 = none) measured too, its measurement is the core.
     """
     m, N = rows.shape
     W, S = np.zeros((3, 3)), np.zeros((3, 3))
@@ -115,6 +116,8 @@ def gate_groups(rows: NDArray[np.int64], positions: Array, covariances: Array, t
             trace = covariances[d, 0, 0] + covariances[d, 1, 1] + covariances[d, 2, 2]
             if count > support or (count == support and trace < spread):
                 core, support, spread = i, count, trace
+        if trusted >= 0 and rows[k, trusted] >= 0:
+            core = trusted
         for i in range(N):
             if i != core and not agree[core, i]:
                 rows[k, i] = -1

@@ -78,6 +78,7 @@ def fuse_given(
     frame: int = 0,
     gain: Gain = "covariance",
     gate: float | None = None,
+    trust_own: bool = False,
     frame_covariance: Array | None = None,
 ) -> FusedObjects:
     """Fused objects with the poses as they are, `gain` "covariance" or "paper"; arguments as in `gains.fuse`."""
@@ -89,7 +90,7 @@ def fuse_given(
     used, members = used[keep], groups.members[keep]
     rows = np.where(used, members + offsets, -1)
     if np.isfinite(threshold):
-        gate_groups(rows, positions, covariances, threshold)
+        gate_groups(rows, positions, covariances, threshold, frame if trust_own else -1)
         used = rows >= 0
     if frame_covariance is None or gain != "covariance":
         fused, fused_covariances = fuse_groups(rows, positions, covariances)

@@ -48,6 +48,7 @@ def refine(
     *,
     frame: int = 0,
     gate: float | None = None,
+    trust_own: bool = False,
     huber: float | None = None,
     iterations: int = 30,
 ) -> Refined:
@@ -58,7 +59,7 @@ def refine(
         poses: (i, j) -> what is known of the relative pose, any pairs; may be empty, then the matches alone count.
         matchings: (i, j) -> Matching, or groups.
         frame: the robot in whose sensor frame everything is expressed.
-        gate: as in `fuse`, applied with the given poses before the joint estimate.
+        gate, trust_own: as in `fuse`, applied with the given poses before the joint estimate.
         huber: Mahalanobis distance beyond which a measurement's influence stops growing; None = least squares.
     """
     groups = matchings if isinstance(matchings, Groups) else group_detections([len(g) for g in graphs], matchings)
@@ -69,7 +70,7 @@ def refine(
     problem = _Problem.build(graphs, groups, placed, frame)
     if gate is not None:
         start = {(frame, j): RelativePose(T[j], _known_covariance(poses, frame, j)) for j in placed if j != frame}
-        kept = fuse_given(graphs, start, groups, frame=frame, gate=gate)
+        kept = fuse_given(graphs, start, groups, frame=frame, gate=gate, trust_own=trust_own)
         problem = _Problem.build(graphs, _only(kept, groups), placed, frame)
     factors = [(i, j, pose) for (i, j), pose in poses.items() if i in T and j in T]
     solver = _Solver(problem, factors, huber)

@@ -44,6 +44,8 @@ def fuse_team(
     }
     gate = None if gain == "paper" else GATE
     return [
-        None if T is None else fuse_own(graphs, relative, groups, i, gain=gain, gate=gate, frame_covariance=C)
+        None
+        if T is None
+        else fuse_own(graphs, relative, groups, i, gain=gain, gate=gate, trust_own=True, frame_covariance=C)
         for i, (T, C) in enumerate(zip(poses, pose_covariances, strict=True))
     ]

@@ -171,6 +171,26 @@ def test_a_robot_with_random_positions_is_outvoted_even_in_its_own_frame():
     assert np.linalg.norm(own.positions - truth[0], axis=1).max() < 0.6
 
 
+@pytest.mark.parametrize("gain", ["covariance", "joint"])
+def test_two_partners_with_a_wrong_match_do_not_outvote_a_robots_own_measurement(gain):
+    rng = np.random.default_rng(11)
+    graphs, poses, matchings, _, truth = team(rng, n_robots=4, pose_std=(0.05, 0.005))
+    # The other robots have one object right among themselves, but it is not the one robot 0 detected.
+    there = {j: int(matchings[0, j].pairs[matchings[0, j].pairs[:, 0] == 1, 1][0]) for j in (1, 2)}
+    wrong = {
+        (0, 1): matching([(0, there[1])]),
+        (0, 2): matching([(0, there[2])]),
+        (1, 2): matching([tuple(there.values())]),
+    }
+    voted, trusting = (
+        fuse_own(graphs, poses, wrong, 0, gain=gain, gate=0.999, trust_own=trust) for trust in (False, True)
+    )
+    assert np.linalg.norm(voted.positions[0] - truth[0][0]) > 1.0
+    assert trusting.positions[0] == pytest.approx(graphs[0].positions[0], abs=1e-3)
+    honest = fuse_own(graphs, poses, matchings, 0, gain=gain, gate=0.999, trust_own=True)
+    assert (honest.n_robots > 2).all()
+
+
 def test_gate_keeps_honest_measurements():
     rng = np.random.default_rng(8)
     used = []
