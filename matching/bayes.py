@@ -11,7 +11,8 @@ import math
 
 import numpy as np
 
-from .bayes_overlap import CONCENTRATION, WEIGHTS, overlap_features
+from .bayes_calibration import Calibration, calibrated, calibration_of, pair_features
+from .bayes_overlap import overlap_features
 from .bayes_prepare import LOG_2PI, Problem, Settings, levelling_rotation, prepare, ranges
 from .bayes_solve import Modes, Prior, decode, mix, solve_levelled, solve_spatial
 from .bayes_view import View
@@ -29,8 +30,14 @@ ALTERNATIVES: tuple[tuple[float, float], ...] = ((0.2, 0.0), (4.0, 0.0), (1.0, 0
 """Factor on all variances, and prior deviation of the robots' depth scales, tried where the reported ones fit badly."""
 
 OTHER_SCALE_PROBABILITY = 0.02
-DOUBTFUL = 1.0
+DOUBTFUL = -1.0
 """Log evidence below which wrong variances and scales are considered."""
+
+MIN_SCORE, FEW, MIN_SCORE_FEW = 0.42, 5, 0.21
+"""Half the F1 to be expected where no calibration says otherwise; of views of at most FEW objects without a prior."""
+
+REPORTED_EXTENT = 0.54
+"""Factor on `extent` for cameras that report full covariances: these know of part of it."""
 
 
 def bayes(
@@ -39,7 +46,7 @@ def bayes(
     *,
     prior: RelativePose | None = None,
     rng: np.random.Generator | None = None,
-    min_score: float = 0.42,
+    min_score: float | None = None,
     common_probability: float = 0.5,
     bearing_std_rad: float = DEFAULT_BEARING_STD_RAD,
     class_sharpness: float = 2.25,
@@ -65,12 +72,14 @@ def bayes(
         prior: noisy relative pose, if known; its Gaussian enters the evidence.
         rng: not used, the method is deterministic.
         min_score: matches of a lower probability are not made. A threshold of half the F1 to be expected maximises
-            the F1 pooled over many pairs, whence the default.
+            the F1 pooled over many pairs: by default .42, without a prior .28 for cameras that report full covariances
+            and .21 for views of at most five objects that know their field of view otherwise.
         common_probability: prior probability that two views show any common object; not used with a prior pose.
         bearing_std_rad: error across the viewing ray of graphs without full covariances, radians.
         class_sharpness: power that turns class confidences into likelihoods.
         mislabel: share of class labels that tell nothing.
-        extent: standard deviation of the visible part's centre about the object's, for graphs with intrinsics.
+        extent: standard deviation of the visible part's centre about the object's, for graphs with intrinsics; about
+            half of it where they report full covariances.
         depth_offset, depth_offset_std: prior of the distance from the visible face to the object's centre along the
             ray, which is estimated for every class, for graphs with intrinsics.
         scale_std: prior standard deviation of each robot's relative depth scale, which is then estimated; 0 = no bias.
@@ -82,8 +91,9 @@ def bayes(
 
     Returns:
         Matches with their posterior probabilities; `pose` (None when refused) and `hypotheses` of the modes;
-        `diagnostics["nothing_in_common"]`, the probability of that; `["probabilities"]` (n, m) of all matches;
-        `["log_evidence"]` of the views given that they share objects, over their evidence given that they do not.
+        `diagnostics["nothing_in_common"]`, the probability that there is nothing to match or none of the modes is
+        right; `["probabilities"]` (n, m) of all matches; `["log_evidence"]` of the views given that they share objects,
+        over their evidence given that they do not.
 
     Raises:
         ValueError: graphs of different classes, or an option out of its range.
@@ -96,11 +106,16 @@ def bayes(
     q = Settings(
         class_sharpness, mislabel, 4.0, 3.0, 0.8, 1.2, 1.5, extent, depth_offset, depth_offset_std, scale_std, 0.04
     )
+    if source.covariances is not None and target.covariances is not None:
+        q = q._replace(extent=REPORTED_EXTENT * extent)
     gravity = source.up is not None and target.up is not None
     L_a, L_b = _levelling(source, gravity), _levelling(target, gravity)
     view_a, view_b = _views(source, target, L_a, L_b, detection)
 
-    def explain(scale: float, depth_scale_std: float) -> Modes:
+    seen = view_a.known > 0 and view_b.known > 0
+    calibration = None if prior is not None else calibration_of(source, target, gravity, seen)
+
+    def explain(scale: float, depth_scale_std: float) -> tuple[Problem, Modes]:
         problem = prepare(
             *_arrays(source, scale),
             L_a,
@@ -109,35 +124,30 @@ def bayes(
             bearing_std_rad**2,
             gravity,
             source.intrinsics is not None and target.intrinsics is not None,
-            view_a.known > 0 and view_b.known > 0,
+            seen,
             q._replace(scale_std=depth_scale_std),
         )
         solve = solve_levelled if gravity else solve_spatial
         pose_prior = _pose_prior(prior, problem, L_a, L_b, gravity)
-        found = solve(problem, pose_prior, view_a, view_b, q, screened, refined)
-        if prior is not None:
-            return found
-        if not gravity or view_a.known > 0:
-            return found._replace(log_evidence=found.log_evidence + POSE_CONCENTRATION)
-        features = overlap_features(
-            problem.p_a,
-            problem.p_b,
-            problem.likely,
-            problem.median_range,
-            found.R,
-            found.t,
-            found.marginals,
-            found.log_evidence,
-        )
-        return found._replace(log_evidence=features @ WEIGHTS + CONCENTRATION)
+        return problem, solve(problem, pose_prior, view_a, view_b, q, screened, refined)
 
-    modes = explain(1.0, scale_std)
-    if rescale and modes.log_evidence.max(initial=-math.inf) < DOUBTFUL:
-        modes = _joined([modes, *(explain(*x) for x in ALTERNATIVES)])
+    problem, found = explain(1.0, scale_std)
+    explanations = [(problem, found)]
+    if rescale and found.log_evidence.max(initial=-math.inf) < DOUBTFUL:
+        explanations += [_improbable(*explain(*x)) for x in ALTERNATIVES]
+    if calibration is not None:
+        pair = pair_features(problem)
+        explanations = [(x, _judged(x, y, pair, calibration)) for x, y in explanations]
+    modes = _joined([y for _, y in explanations]) if len(explanations) > 1 else explanations[0][1]
+    if calibration is None and prior is None:
+        modes = modes._replace(log_evidence=modes.log_evidence + POSE_CONCENTRATION)
     if prior is None:
         weights, P = mix(modes, math.log(common_probability), math.log1p(-common_probability), n, m)
     else:
         weights, P = mix(modes, 0.0, -1e9, n, m)
+    if min_score is None:
+        few = seen and prior is None and min(n, m) <= FEW
+        min_score = calibration.min_score if calibration else MIN_SCORE_FEW if few else MIN_SCORE
     pairs, scores = decode(P, min_score)
     hypotheses = _hypotheses(modes, weights, L_a, L_b, gravity, max_hypotheses)
     likeliest = hypotheses[0] if hypotheses else None
@@ -156,8 +166,8 @@ def bayes(
     )
 
 
-def _check_options(min_score: float, common_probability: float, screened: int, refined: int) -> None:
-    if not 0.0 <= min_score <= 1.0:
+def _check_options(min_score: float | None, common_probability: float, screened: int, refined: int) -> None:
+    if min_score is not None and not 0.0 <= min_score <= 1.0:
         raise ValueError(f"min_score must lie in [0, 1], got {min_score}")
     if not 0.0 < common_probability < 1.0:
         raise ValueError(f"common_probability must lie in (0, 1), got {common_probability}")
@@ -169,14 +179,24 @@ def _levelling(graph: ObjectGraph, gravity: bool) -> Array:
     return levelling_rotation(graph.up) if gravity else np.eye(3)
 
 
+def _improbable(problem: Problem, modes: Modes) -> tuple[Problem, Modes]:
+    """Modes under other variances or scales than the reported ones."""
+    return problem, modes._replace(log_evidence=modes.log_evidence + math.log(OTHER_SCALE_PROBABILITY))
+
+
+def _judged(x: Problem, modes: Modes, pair: Array, calibration: Calibration) -> Modes:
+    features = overlap_features(
+        x.p_a, x.p_b, x.likely, x.median_range, modes.R, modes.t, modes.marginals, modes.log_evidence
+    )
+    return modes._replace(log_evidence=calibrated(features, pair, calibration))
+
+
 def _joined(alternatives: list[Modes]) -> Modes:
-    """Modes under the reported variances (first) and under others, which are improbable beforehand."""
-    count = np.concatenate([np.full(len(x.log_evidence), k) for k, x in enumerate(alternatives)])
+    """All modes as one list, best first, with the parameters that all of them have."""
     size = min(x.information.shape[1] for x in alternatives)
     bias = min(x.bias.shape[1] for x in alternatives)
     trimmed = [x._replace(bias=x.bias[:, :bias], information=_marginal(x.information, size)) for x in alternatives]
     arrays = [np.concatenate(x) for x in zip(*trimmed, strict=True)]
-    arrays[3] = arrays[3] + np.where(count > 0, math.log(OTHER_SCALE_PROBABILITY), 0.0)
     order = np.argsort(-arrays[3], kind="stable")
     return Modes(*(np.ascontiguousarray(x[order]) for x in arrays))
 

@@ -18,11 +18,7 @@ RINGS, RAYS = 10, 12
 LEAST_SHARE = 0.02
 LEAST_DISTANCE = 0.2
 
-EVIDENCE, CLASSES, ALONE, EXPECTED, MATCHED, SHARE, NEAR, FAR = 0.67, 0.43, -0.62, 0.29, 1.16, 4.13, 2.44, -3.56
-"""Weights of `overlap_features`, and CONCENTRATION the constant: fitted by conditional likelihood (see the docs)."""
-
-CONCENTRATION = 4.0
-WEIGHTS = np.array([EVIDENCE, CLASSES, ALONE, EXPECTED, MATCHED, SHARE, NEAR, FAR])
+N_FEATURES = 8
 
 
 @njit(cache=True)
@@ -79,7 +75,7 @@ def overlap_features(
     marginals: Array,
     log_evidence: Array,
 ) -> Array:
-    """What WEIGHTS weigh of every mode, (k, 8).
+    """What is weighed of every mode, (k, 8).
 
     In order: log evidence; class evidence of the matches; objects alone in the other robot's sector; objects expected
     there; matches times log(1 / share of the sectors that overlap); log of that share; log distance of the robots;
@@ -91,7 +87,7 @@ def overlap_features(
     n, m, count = len(p_a) - 1, len(p_b) - 1, len(R)
     sector_a, sector_b = seen_sector(p_a), seen_sector(p_b)
     grid_a, grid_b = sector_grid(sector_a), sector_grid(sector_b)
-    out = np.zeros((count, len(WEIGHTS)))
+    out = np.zeros((count, N_FEATURES))
     alone_b = np.empty(m)
     for k in range(count):
         c, s, tx, ty = R[k, 0, 0], R[k, 1, 0], t[k, 0], t[k, 1]

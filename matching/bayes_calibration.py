@@ -1,0 +1,93 @@
+"""How far evidence is to be trusted: what a match says, and what chance would explain as well.
+
+A wrong pose often explains two views better than the true one, and errors that the model takes for independent are not.
+So a mode's evidence is damped, the more the less a single match says; the weights were fitted (see the docs).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from .bayes_prepare import Problem
+from .graph import ObjectGraph
+from .pose import Array
+
+
+class Calibration(NamedTuple):
+    """Calibrated log evidence of a mode: exp(damping . pair features) (terms . mode features) + offset . pair features.
+
+    Attributes:
+        terms: weights of `overlap_features`.
+        damping, offset: weights of `pair_features`.
+        min_score: half the F1 to be expected of such pairs, which as a threshold maximises F1 pooled over many.
+    """
+
+    terms: Array
+    damping: Array
+    offset: Array
+    min_score: float
+
+
+UNSEEN = Calibration(
+    np.array([0.432, 0.142, -0.258, 0.125, 0.445, 1.526, 1.068, -1.824]),
+    np.array([0.0, 0.61, 0.02, 0.22, 0.0]),
+    np.array([2.9, 1.54, 0.29, -0.24, 0.0]),
+    0.42,
+)
+"""For graphs that know gravity and no field of view."""
+
+EYES = Calibration(
+    np.array([0.293, 0.445, 0.0, 0.0, 0.0, 0.0, 2.648, -1.994]),
+    np.array([0.0, -0.02, -1.02, 0.54, 0.02]),
+    np.array([-0.18, 0.07, -0.29, 1.62, -1.68]),
+    0.28,
+)
+"""For cameras that report full covariances: one network's errors in one image go together."""
+
+
+@njit(cache=True)
+def pair_features(x: Problem) -> Array:
+    """What decides how well a wrong pose may explain two views, (5,), each but the first about a usual value.
+
+    In order: 1; nats that a match says by its place: log of a view's room over the area that both errors together
+    leave open; nats that it says by its class; how differently high the robots stand, in median ranges; log of the
+    smaller number of objects.
+    """
+    n, m = len(x.p_a) - 1, len(x.p_b) - 1
+    area = height = 0.0
+    for i in range(n):
+        area += np.sqrt(max(x.S_a[i, 0, 0] * x.S_a[i, 1, 1] - x.S_a[i, 0, 1] ** 2, 1e-18)) / n
+        height += x.p_a[i, 2] / n
+    for j in range(m):
+        area += np.sqrt(max(x.S_b[j, 0, 0] * x.S_b[j, 1, 1] - x.S_b[j, 0, 1] ** 2, 1e-18)) / m
+        height -= x.p_b[j, 2] / m
+    total = nats = 0.0
+    for i in range(n):
+        for j in range(m):
+            ratio = np.exp(x.likely[i, j])
+            total += ratio
+            nats += ratio * x.likely[i, j]
+    place = np.log(0.5 * (x.room_a + x.room_b) / (2.0 * np.pi * area))
+    # Beyond what the weights were fitted on, features count as at the border of it.
+    place = min(max(place - 5.0, -1.5), 1.5)
+    high = min(abs(height) / x.median_range - 0.2, 1.0)
+    few = min(max(np.log(min(n, m)) - 2.2, -1.1), 0.9)
+    return np.array([1.0, place, min(nats / total - 0.5, 1.0), high, few])
+
+
+def calibration_of(source: ObjectGraph, target: ObjectGraph, gravity: bool, seen: bool) -> Calibration | None:
+    """The calibration for such graphs; None: their evidence counts whole (no gravity, or views known otherwise)."""
+    if not gravity:
+        return None
+    if not seen:
+        return UNSEEN
+    graphs = (source, target)
+    return EYES if all(g.intrinsics is not None and g.covariances is not None for g in graphs) else None
+
+
+def calibrated(features: Array, pair: Array, calibration: Calibration) -> Array:
+    """Calibrated log evidence (k,) of modes with `features` (k, 8), of a pair of views with features `pair` (5,)."""
+    return np.exp(pair @ calibration.damping) * (features @ calibration.terms) + pair @ calibration.offset
