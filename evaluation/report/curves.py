@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ...matching.metrics import reliability
 from ..records import Record
-from .charts import Series, chart, linear_axis, log_axis, unit_axis
+from .charts import Axis, Series, chart, linear_axis, log_axis, unit_axis
 from .html import Child, Element, h
 from .leaderboard import key
 from .run import Entry, Group
@@ -56,23 +56,33 @@ def precision_recall(groups: Sequence[Group]) -> Element:
 
 
 def _pr_panel(group: Group) -> Element:
-    series, legend = [], []
-    for e in group.entries:
-        recall, precision = pr_curve(e.records)
-        if not len(recall):
-            continue
-        legend.append((e.method, e.label, f"{average_precision(recall, precision):.3f}"))
-        kept = _thinned(len(recall))
-        points = list(zip(recall[kept].tolist(), precision[kept].tolist(), strict=True))
-        series.append(Series(e.label, points, e.method))
-        series.append(Series(e.label, [points[-1]], e.method, line=False))
-    figure = chart(
-        f"Precision against recall of {len(legend)} methods on {group.name}",
-        unit_axis("recall"),
-        unit_axis("precision"),
-        series,
-    )
-    return panel(group, figure, legend)
+    found = [(e, *_pr_series(e)) for e in group.entries]
+    return _panel_of(group, "Precision against recall", unit_axis("recall"), unit_axis("precision"), found)
+
+
+def _pr_series(e: Entry) -> tuple[str, list[Series]]:
+    recall, precision = pr_curve(e.records)
+    if not len(recall):
+        return "", []
+    kept = _thinned(len(recall))
+    points = list(zip(recall[kept].tolist(), precision[kept].tolist(), strict=True))
+    ends = [Series(e.label, points, e.method), Series(e.label, [points[-1]], e.method, line=False)]
+    return f"{average_precision(recall, precision):.3f}", ends
+
+
+def _panel_of(
+    group: Group,
+    title: str,
+    x: Axis,
+    y: Axis,
+    found: Sequence[tuple[Entry, str, list[Series]]],
+    diagonal: bool = False,
+) -> Element:
+    """Curves of the methods that have any, each with a figure beside its name."""
+    drawn = [(e, value, series) for e, value, series in found if series]
+    curves = [s for _, _, series in drawn for s in series]
+    figure = chart(f"{title} of {len(drawn)} methods on {group.name}", x, y, curves, diagonal=diagonal)
+    return panel(group, figure, [(e.method, e.label, value) for e, value, _ in drawn])
 
 
 def pr_curve(records: Sequence[Record]) -> tuple[Values, Values]:
@@ -110,16 +120,17 @@ def calibration(groups: Sequence[Group]) -> Element:
 
 
 def _calibration_panel(group: Group) -> Element:
-    series, legend = [], []
-    for e in group.entries:
-        scores = np.array([s for r in e.records for s in r.scores])
-        if not len(scores):
-            continue
-        bins = reliability(scores, np.array([h for r in e.records for h in r.hits], dtype=bool))
-        series.append(Series(e.label, [(b.score, b.accuracy) for b in bins], e.method, markers=True))
-        legend.append((e.method, e.label, "" if e.row["ece"] is None else f"{e.row['ece']:.3f}"))
-    title = f"Reliability of {len(legend)} methods on {group.name}"
-    return panel(group, chart(title, unit_axis("mean score"), unit_axis("share right"), series, diagonal=True), legend)
+    found = [(e, *_calibration_series(e)) for e in group.entries]
+    return _panel_of(group, "Reliability", unit_axis("mean score"), unit_axis("share right"), found, diagonal=True)
+
+
+def _calibration_series(e: Entry) -> tuple[str, list[Series]]:
+    scores = np.array([s for r in e.records for s in r.scores])
+    if not len(scores):
+        return "", []
+    bins = reliability(scores, np.array([h for r in e.records for h in r.hits], dtype=bool))
+    points = [(b.score, b.accuracy) for b in bins]
+    return "" if e.row["ece"] is None else f"{e.row['ece']:.3f}", [Series(e.label, points, e.method, markers=True)]
 
 
 # Range and occlusion
