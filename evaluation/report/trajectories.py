@@ -72,7 +72,7 @@ def _tracks(group: Group) -> list[Element]:
 def _panel(group: Group, entry: Entry, page: Page, found: Sequence[topview.Track], which: str) -> Element:
     what = "one robot alone" if which == "single" else "fused"
     index = 0 if which == "single" else 1
-    errors = ", ".join(f"object {t.identity} ({t.observer}) {t.errors[index]:.2f} m" for t in found)
+    errors = ", ".join(f"object {t.identity} ({t.observer}) {t.errors[index]:.3f} m" for t in found)
     words = f"matched by {entry.label}; {when(page, with_frame=False)}. Mean error: {errors}."
     caption = h("figcaption", None, h("strong", None, f"{group.name}: {what}"), words)
     figure = topview.trajectories(group.name, found, which)

@@ -2,8 +2,15 @@
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from covis.evaluation.statistics import bootstrap_f1, bootstrap_mean, episode_sums, paired_difference
+from covis.evaluation.statistics import (
+    bootstrap_f1,
+    bootstrap_interval,
+    bootstrap_mean,
+    episode_sums,
+    paired_difference,
+)
 from covis.matching.metrics import Counts
 
 
@@ -77,3 +84,63 @@ def test_the_interval_of_a_mean_narrows_and_holds_it():
         assert low < values.mean() < high
         assert high - low == pytest.approx(4 * values.std() / np.sqrt(len(values)), rel=0.15)
     assert bootstrap_mean([2.0, 2.0]) == (2.0, 2.0)
+
+
+def episodes_of(rng, n, skill):
+    """Correct, retrieved, common (n, 3) of n episodes."""
+    common = rng.integers(8, 14, n)
+    return np.column_stack([rng.binomial(common, skill), rng.integers(8, 14, n), common]).astype(float)
+
+
+def pooled_f1(*columns, axis=-1):
+    correct, retrieved, common = (np.sum(c, axis=axis) for c in columns)
+    return 2 * correct / (retrieved + common)
+
+
+def test_intervals_and_p_values_are_those_of_scipy():
+    rng = np.random.default_rng(4)
+    a, b = episodes_of(rng, 9, 0.7), episodes_of(rng, 9, 0.55)
+    own, other = dict(enumerate(a)), dict(enumerate(b))
+    scipy_options = {"paired": True, "vectorized": True, "method": "percentile", "n_resamples": 40_000, "rng": 5}
+    interval = stats.bootstrap(tuple(a.T), pooled_f1, **scipy_options).confidence_interval
+    assert bootstrap_interval(own, samples=40_000) == pytest.approx(tuple(interval), abs=0.004)
+
+    def difference(*columns, axis=-1):
+        return pooled_f1(*columns[:3]) - pooled_f1(*columns[3:])
+
+    both = stats.bootstrap((*a.T, *b.T), difference, **scipy_options).confidence_interval
+    found = paired_difference(own, other, samples=40_000)
+    assert (found.low, found.high) == pytest.approx(tuple(both), abs=0.006)
+    assert found.value == pytest.approx(float(difference(*a.T, *b.T)))
+
+    # Whole episodes change sides: each is one observation, told apart by its number.
+    def of_sides(first, second, axis=-1):
+        numbers = [np.asarray(x).astype(int) for x in (first, second)]
+        pool = np.concatenate([a, b])
+        return difference(*(pool[n][..., k] for n in numbers for k in range(3)))
+
+    sides = stats.permutation_test(
+        (np.arange(9), np.arange(9, 18)),
+        of_sides,
+        permutation_type="samples",
+        vectorized=True,
+        n_resamples=np.inf,
+        alternative="two-sided",
+    )
+    # SciPy doubles the smaller tail, we count both: the same, as exchanging all episodes changes the sign.
+    assert found.p_value == pytest.approx(sides.pvalue, abs=1e-9)
+
+
+def test_of_two_methods_that_are_equally_good_few_are_called_a_winner():
+    rng = np.random.default_rng(11)
+    calls = [
+        not paired_difference(
+            dict(enumerate(episodes_of(rng, 8, 0.6))), dict(enumerate(episodes_of(rng, 8, 0.6))), samples=400
+        ).noise
+        for _ in range(300)
+    ]
+    assert np.mean(calls) <= 0.08  # .05, and two standard errors of 300 trials
+    clear = paired_difference(
+        dict(enumerate(episodes_of(rng, 8, 0.9))), dict(enumerate(episodes_of(rng, 8, 0.4))), samples=400
+    )
+    assert not clear.noise
