@@ -31,9 +31,10 @@ class Matched:
 
 
 def fused(frame: Frame, found: Sequence[Matched]) -> dict[str, Team]:
-    """By method, what the matches of a whole frame give each robot; of robots without a pose, nothing."""
+    """By method, what the matches of a whole frame give each robot with a pose; nothing where no truth is known."""
     views = frame.views
-    if len(views) > MAX_ROBOTS or all(view.pose is None for view in views):
+    known = any(view.pose is not None and np.isfinite(_true_positions(view)).any() for view in views)
+    if len(views) > MAX_ROBOTS or not known:
         return {}
     graphs = [view.graph for view in views]
     poses, covariances = [view.pose for view in views], [view.pose_covariance for view in views]
