@@ -36,7 +36,7 @@ class Localizer:
         match: a matcher, or its name.
         pose: `known` hands the robots' noisy relative pose to the matcher as prior. Fusion uses the poses either way,
             as the paper does (section 3.5).
-        gain: "covariance" or "paper", see `covis.fusion`.
+        gain: one of `covis.fusion.objects.GAINS`.
         max_detections: K; of more detections the largest boxes are kept.
         options: passed on to the matcher.
     """

@@ -74,6 +74,7 @@ def estimators(scene: str) -> dict[str, MemberOptions]:
     return {
         "paper": replace(frame, gain="paper"),
         "covariance": frame,
+        "intersection": replace(frame, gain="intersection"),
         "joint": replace(frame, gain="joint"),
         "paper, tracked": replace(tracked, gain="paper"),
         "covariance, tracked": tracked,

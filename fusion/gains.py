@@ -2,8 +2,9 @@
 
 Detections that matchings connect form a group: one object. The measurements of a group are brought into one robot's
 sensor frame and fused. `gain="covariance"` weighs them by full covariances, the relative pose's covariance added to
-the partner's measurement; `gain="joint"` also lets the matches correct the poses (see `refine`); `gain="paper"` is eq.
-20-22 to the letter: isotropic u, poses taken as exact.
+the partner's measurement; `gain="intersection"` does not rely on their errors being independent; `gain="joint"` also
+lets the matches correct the poses (see `refine`); `gain="paper"` is eq. 20-22 to the letter: isotropic u, poses taken
+as exact.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ def fuse(
         poses: (i, j) -> pose of robot j's sensor in robot i's frame; needed between `frame` and its partners, in
             either direction. A partner without one does not contribute.
         matchings: (i, j) -> Matching, or groups made by `group_detections`.
-        gain: "covariance", "joint" or "paper".
+        gain: "covariance", "intersection", "joint" or "paper".
         gate: share of honest measurements to keep, for example 0.999; what disagrees more with the rest of its group is
             left out (`used`), so that a robot that is wrong does not drag the estimate. None = keep all.
         trust_own: what disagrees with the frame robot's own measurement is left out, instead of what disagrees with

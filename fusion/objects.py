@@ -13,11 +13,12 @@ from scipy.stats import chi2
 
 from ..matching.graph import ObjectGraph
 from ..matching.pose import Array, RelativePose, skews
+from .gaussian import covariance_intersection
 from .groups import Groups
 from .kernels import fuse_groups, gate_groups
 
-Gain = Literal["covariance", "joint", "paper"]
-GAINS: tuple[Gain, ...] = ("covariance", "joint", "paper")
+Gain = Literal["covariance", "intersection", "joint", "paper"]
+GAINS: tuple[Gain, ...] = ("covariance", "intersection", "joint", "paper")
 
 UNKNOWN_VARIANCE = 1e6
 """m^2 in place of an infinite variance."""
@@ -81,7 +82,7 @@ def fuse_given(
     trust_own: bool = False,
     frame_covariance: Array | None = None,
 ) -> FusedObjects:
-    """Fused objects with the poses as they are, `gain` "covariance" or "paper"; arguments as in `gains.fuse`."""
+    """Fused objects with the poses as they are, any `gain` but "joint"; arguments as in `gains.fuse`."""
     threshold = _threshold(gate)
     positions, covariances, located = _in_frame(graphs, poses, frame, gain)
     offsets = np.concatenate([[0], np.cumsum([len(g) for g in graphs])])[:-1]
@@ -92,7 +93,9 @@ def fuse_given(
     if np.isfinite(threshold):
         gate_groups(rows, positions, covariances, threshold, frame if trust_own else -1)
         used = rows >= 0
-    if frame_covariance is None or gain != "covariance":
+    if gain == "intersection":
+        fused, fused_covariances = _intersect_groups(rows, positions, covariances)
+    elif frame_covariance is None or gain == "paper":
         fused, fused_covariances = fuse_groups(rows, positions, covariances)
     else:
         fused, fused_covariances = _fuse_sharing(rows, positions, covariances, frame, frame_covariance)
@@ -179,6 +182,19 @@ def _move(pose: RelativePose, positions: Array, covariances: Array, gain: Gain) 
     if gain == "paper":
         return moved, covariances
     return moved, R @ covariances @ R.T + pose.position_covariances(positions)
+
+
+def _intersect_groups(rows: NDArray[np.int64], positions: Array, covariances: Array) -> tuple[Array, Array]:
+    """As `fuse_groups`, consistent however the measurements' errors are correlated; the weights minimise the trace."""
+    fused, fused_covariances = np.zeros((len(rows), 3)), np.zeros((len(rows), 3, 3))
+    for k, row in enumerate(rows):
+        members = row[row >= 0]
+        if len(members) == 1:
+            fused[k], fused_covariances[k] = positions[members[0]], covariances[members[0]]
+        else:
+            both = covariance_intersection(positions[members], covariances[members])
+            fused[k], fused_covariances[k] = both.mean, both.covariance
+    return fused, fused_covariances
 
 
 def _fuse_sharing(

@@ -29,6 +29,8 @@ COLUMNS = {
         "alone_n",
         "alone_fused_m",
         "alone_nees_per_dof",
+        "gospa_m",
+        "identity_switches",
     ),
     "faults": ("fault", "matches", "protections", "precision", "f1", "fused_m", "growth", "nees_per_dof"),
     "team": (

@@ -29,6 +29,22 @@ def test_gospa_by_hand():
     assert result.localisation == pytest.approx(1.0)
 
 
+def test_gospa_agrees_with_stone_soup():
+    pytest.importorskip("stonesoup", reason="stonesoup is not installed")
+    from stonesoup.metricgenerator.ospametric import GOSPAMetric
+    from stonesoup.types.state import State
+
+    rng = np.random.default_rng(2)
+    for n, m in ((4, 6), (7, 3), (5, 5)):
+        x, t = rng.uniform(0, 4, size=(n, 3)), rng.uniform(0, 4, size=(m, 3))
+        theirs, _ = GOSPAMetric(p=2, c=1.5).compute_gospa_metric(
+            [State(v[:, None]) for v in x], [State(v[:, None]) for v in t]
+        )
+        ours = gospa(x, t, cutoff=1.5)
+        assert ours.distance == pytest.approx(theirs.value["distance"])
+        assert ours.localisation == pytest.approx(theirs.value["localisation"])
+
+
 def test_gospa_of_empty_sets():
     assert gospa(np.zeros((0, 3)), np.zeros((0, 3))).distance == 0
     assert gospa(np.zeros((0, 3)), np.zeros((4, 3)), cutoff=1.0).distance == pytest.approx(np.sqrt(2))

@@ -127,6 +127,18 @@ def test_covariance_gain_adds_the_pose_to_the_partner():
         np.testing.assert_allclose(fused.covariances[k], expected.covariance, rtol=1e-6)
 
 
+def test_intersection_stays_consistent_where_partners_repeat_one_measurement():
+    """Two reports of one robot, taken for two robots: information fusion halves the variance, intersection does not."""
+    graph = ObjectGraph.from_positions(np.array([[5.0, 1, 0]]), covariances=np.diag([1.0, 0.1, 0.1])[None])
+    pose = RelativePose(np.eye(4), np.zeros((6, 6)))
+    same = matching((0, 0))
+    args = ([graph, graph, graph], {(0, 1): pose, (0, 2): pose}, {(0, 1): same, (0, 2): same})
+    fused = fuse(*args, gain="intersection")
+    assert fused.positions[0] == pytest.approx([5, 1, 0])
+    assert fused.covariances[0] == pytest.approx(graph.covariances[0], rel=1e-3, abs=1e-6)
+    assert fuse(*args).covariances[0] == pytest.approx(graph.covariances[0] / 3, rel=1e-6)
+
+
 def test_fused_positions_are_consistent_and_better_monte_carlo():
     rng = np.random.default_rng(3)
     errors, covariances, single, paper = [], [], [], []
