@@ -195,6 +195,9 @@ def _nothing() -> tuple[NDArray[np.int64], NDArray[np.bool_], Array]:
 def tie(boxes: Array, true_boxes: Array, pixels: NDArray[np.int64]) -> NDArray[np.int64]:
     """Object index (K,) of each claimed box (K, 4), -1 = none; true boxes (m, 4), visible pixels (m,)."""
     K, m = len(boxes), len(true_boxes)
+    out = np.full(K, -1, dtype=np.int64)
+    if not (boxes[:, 2] > boxes[:, 0]).any():
+        return out
     iou = np.zeros((K, m))
     for k in range(K):
         u0, v0, u1, v1 = boxes[k]
@@ -208,7 +211,6 @@ def tie(boxes: Array, true_boxes: Array, pixels: NDArray[np.int64]) -> NDArray[n
             if width > 0 and height > 0:
                 overlap = width * height
                 iou[k, j] = overlap / ((u1 - u0) * (v1 - v0) + (t1 - t0) * (w1 - w0) - overlap)
-    out = np.full(K, -1, dtype=np.int64)
     for _ in range(min(K, m)):
         best = int(np.argmax(iou))
         k, j = best // m, best % m

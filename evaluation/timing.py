@@ -11,26 +11,35 @@ from typing import Any
 Job = Callable[[], object]
 
 
-def rates(ours: Job, peer: Job | None = None, *, seconds: float = 1.0, rounds: int = 5) -> tuple[float, float | None]:
+def rates(
+    ours: Job,
+    peer: Job | None = None,
+    *,
+    seconds: float = 1.0,
+    rounds: int = 5,
+    clock: Callable[[], float] = perf_counter,
+) -> tuple[float, float | None]:
     """Runs per second (median over rounds) of two jobs, alternately; each job is warmed up once.
 
     Args:
         ours, peer: called without arguments.
         seconds: least time per job and round, so that short jobs are repeated.
         rounds: measurements of each.
+        clock: seconds; `process_time` for jobs of one thread that never wait, so that other work on the machine counts
+            on neither side.
     """
     jobs = [ours] if peer is None else [ours, peer]
-    repeats = [_repeats(job, seconds) for job in jobs]
+    repeats = [_repeats(job, seconds, clock) for job in jobs]
     measured: list[list[float]] = [[] for _ in jobs]
     was_enabled = gc.isenabled()
     gc.disable()
     try:
         for _ in range(rounds):
             for job, n, rate in zip(jobs, repeats, measured, strict=True):
-                start = perf_counter()
+                start = clock()
                 for _ in range(n):
                     job()
-                rate.append(n / (perf_counter() - start))
+                rate.append(n / (clock() - start))
             gc.collect()
     finally:
         if was_enabled:
@@ -38,11 +47,11 @@ def rates(ours: Job, peer: Job | None = None, *, seconds: float = 1.0, rounds: i
     return median(measured[0]), None if peer is None else median(measured[1])
 
 
-def _repeats(job: Job, seconds: float) -> int:
+def _repeats(job: Job, seconds: float, clock: Callable[[], float]) -> int:
     job()
-    start = perf_counter()
+    start = clock()
     job()
-    once = max(perf_counter() - start, 1e-7)
+    once = max(clock() - start, 1e-7)
     return max(1, round(seconds / once))
 
 
