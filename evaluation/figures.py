@@ -127,7 +127,8 @@ def robustness_figure(rows: Sequence[Row]) -> Figure:
 
 
 def _label(row: Row) -> str:
-    return ":".join([row["method"], *(f"{key}={value}" for key, value in row["options"].items())])
+    options = ",".join(f"{key}={value}" for key, value in row["options"].items())
+    return row["method"] + (f":{options}" if options else "")
 
 
 def scaling_figure(rows: Sequence[Row]) -> Figure:
