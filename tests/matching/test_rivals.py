@@ -12,7 +12,7 @@ from covis.matching.clipper import consistency, densest_clique
 from covis.matching.icp import _starts, align, rigid, spread_rotations
 from covis.matching.pose import rotation_from_vector
 from covis.matching.random_walk import distance_affinity, reweighted_random_walk, sinkhorn, sparse
-from covis.matching.rrwhm import triples
+from covis.matching.rrwhm import hypergraph_walk, triples
 from covis.matching.similarity import (
     attribute_similarity,
     contract,
@@ -146,6 +146,24 @@ def test_contract_is_the_tensor_product():
     T = dense(index, values, 16)
     x, y = np.random.default_rng(0).uniform(size=(2, 16))
     np.testing.assert_allclose(contract(index, values, x, y), np.einsum("abc,b,c->a", T, x, y), atol=1e-12)
+
+
+def test_hypergraph_walk_is_the_published_iteration_in_numpy():
+    source, target, _ = small(2)
+    index, values = triples(source, target, 0.5, None)
+    T = dense(index, values, 16)
+    c, beta, steps = 0.2, 30.0, 6
+    x = np.full(16, 1 / 16)
+    for _ in range(steps):
+        walk = np.einsum("abc,b,c->a", T, x, x)
+        walk /= walk.sum()
+        jump = np.exp(beta * walk / walk.max()).reshape(4, 4)
+        for _ in range(9):
+            jump /= jump.sum(axis=1, keepdims=True)
+            jump /= jump.sum(axis=0, keepdims=True)
+        x = c * walk + (1 - c) * jump.ravel() / jump.sum()
+    found = hypergraph_walk(np.zeros(16), np.zeros((0, 0)), index, values, 4, 4, c, beta, steps, 9, 0.0, 0.0)
+    np.testing.assert_allclose(found.ravel(), x, atol=1e-12)
 
 
 @pytest.mark.parametrize("matcher", [rrwhm, bcagm])
