@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from .bayes_calibration import Calibration, calibrated, calibration_of, pair_features
+from .bayes_calibration import FEW, Calibration, calibrated, calibration_of, pair_features
 from .bayes_overlap import overlap_features
 from .bayes_prepare import LOG_2PI, Problem, Settings, levelling_rotation, prepare, ranges
 from .bayes_solve import Modes, Prior, decode, mix, solve_levelled, solve_spatial
@@ -33,7 +33,7 @@ OTHER_SCALE_PROBABILITY = 0.02
 DOUBTFUL = -1.0
 """Log evidence below which wrong variances and scales are considered."""
 
-MIN_SCORE, FEW, MIN_SCORE_FEW = 0.42, 5, 0.21
+MIN_SCORE, MIN_SCORE_FEW = 0.42, 0.21
 """Half the F1 to be expected where no calibration says otherwise; of views of at most FEW objects without a prior."""
 
 REPORTED_EXTENT = 0.54

@@ -40,12 +40,23 @@ UNSEEN = Calibration(
 """For graphs that know gravity and no field of view."""
 
 EYES = Calibration(
-    np.array([0.293, 0.445, 0.0, 0.0, 0.0, 0.0, 2.648, -1.994]),
-    np.array([0.0, -0.02, -1.02, 0.54, 0.02]),
-    np.array([-0.18, 0.07, -0.29, 1.62, -1.68]),
+    np.array([0.284, 0.448, 0.0, 0.0, 0.0, 0.0, 2.242, -1.617]),
+    np.array([0.0, -0.08, -0.99, 0.61, 0.05]),
+    np.array([-0.57, -0.08, 0.12, 1.52, -1.69]),
     0.28,
 )
 """For cameras that report full covariances: one network's errors in one image go together."""
+
+FIELDS = Calibration(
+    np.array([0.312, -0.022, 0.027, -0.072, 0.292, 5.916, 2.376, -1.962]),
+    np.array([0.0, 0.51, -0.22, 0.15, 0.0]),
+    np.array([4.88, 1.74, -1.04, 1.05, 0.0]),
+    0.42,
+)
+"""For known fields of view without images, and more than FEW objects: some of them hide."""
+
+FEW = 5
+"""Objects of the smaller view up to which known fields of view without images count as they are."""
 
 
 @njit(cache=True)
@@ -79,13 +90,15 @@ def pair_features(x: Problem) -> Array:
 
 
 def calibration_of(source: ObjectGraph, target: ObjectGraph, gravity: bool, seen: bool) -> Calibration | None:
-    """The calibration for such graphs; None: their evidence counts whole (no gravity, or views known otherwise)."""
+    """The calibration for such graphs; None: their evidence counts whole."""
+    graphs = (source, target)
     if not gravity:
         return None
     if not seen:
         return UNSEEN
-    graphs = (source, target)
-    return EYES if all(g.intrinsics is not None and g.covariances is not None for g in graphs) else None
+    if all(g.intrinsics is not None and g.covariances is not None for g in graphs):
+        return EYES
+    return FIELDS if all(g.intrinsics is None and len(g) > FEW for g in graphs) else None
 
 
 def calibrated(features: Array, pair: Array, calibration: Calibration) -> Array:

@@ -10,7 +10,7 @@ import pytest
 
 from covis.matching import ObjectGraph, RelativePose, bayes
 from covis.matching.bayes_assignment import assignment_marginals
-from covis.matching.bayes_calibration import EYES, UNSEEN, calibrated, pair_features
+from covis.matching.bayes_calibration import EYES, FEW, FIELDS, UNSEEN, calibrated, calibration_of, pair_features
 from covis.matching.bayes_overlap import MARGIN_RAD, REACH, overlap_features
 from covis.matching.bayes_prepare import Settings, class_evidence, height_correction, levelling_rotation, prepare
 from covis.matching.metrics import count, expected_calibration_error, is_correct, pooled
@@ -453,11 +453,24 @@ def test_calibrated_evidence_keeps_the_order_of_equal_modes_and_falls_where_matc
     rng = np.random.default_rng(13)
     features = rng.standard_normal((20, 8))
     features[:, 1:] = features[0, 1:]
-    for calibration in (UNSEEN, EYES):
+    for calibration in (UNSEEN, EYES, FIELDS):
         telling, vague = np.array([1.0, 1.0, 0.0, 0.0, 0.0]), np.array([1.0, -1.0, 0.0, 0.0, 0.0])
         strong = calibrated(features, telling, calibration)
         np.testing.assert_array_equal(np.argsort(strong), np.argsort(features[:, 0]))
     assert np.ptp(calibrated(features, vague, UNSEEN)) < 0.5 * np.ptp(calibrated(features, telling, UNSEEN))
+
+
+def test_which_calibration():
+    (a, _), (b, _) = crowd(np.random.default_rng(15), n=60)
+    assert min(len(a), len(b)) > FEW
+    assert calibration_of(a, b, True, True) is EYES
+    assert calibration_of(a, b, False, True) is None
+    plain, other = (replace(g, intrinsics=None, image_size=None) for g in (a, b))
+    assert calibration_of(plain, other, True, False) is UNSEEN
+    assert calibration_of(plain, other, True, True) is FIELDS
+    assert calibration_of(plain, other.take(np.arange(4)), True, True) is None
+    # Images without covariances: the detector says nothing of its own errors.
+    assert calibration_of(replace(a, covariances=None), b, True, True) is None
 
 
 def test_default_threshold():
