@@ -207,7 +207,7 @@ COLUMNS: tuple[tuple[str, str, Callable[[dict[str, Any]], str]], ...] = (
     ("precision", "precision", _number("precision")),
     ("recall", "recall", _number("recall")),
     ("f1", "F1", _number("f1")),
-    ("f1_low", "95 %", lambda row: f"{row['f1_low']:.3f}-{row['f1_high']:.3f}"),
+    ("f1_low", "95 %", lambda row: f"{row['f1_low']:.3f}-{row['f1_high']:.3f}" if row["episodes"] > 1 else "1 episode"),
     ("f1_minus_best", "to best", _to_best),
     ("ece", "ECE", _number("ece")),
     ("displacement_single_m", "single m", _number("displacement_single_m")),

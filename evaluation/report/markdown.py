@@ -28,7 +28,10 @@ def _table(group: Group) -> list[str]:
     lines += [f"{n_episodes(group)} episodes.", ""]
     lines += ["| " + " | ".join(titles) + " |", "| --- |" + " ---: |" * (len(titles) - 1)]
     for entry in sorted(group.entries, key=lambda e: -e.f1):
-        cells = [escaped(entry.label), f"{entry.f1:.3f}", f"{entry.row['f1_low']:.3f} to {entry.row['f1_high']:.3f}"]
+        interval = (
+            f"{entry.row['f1_low']:.3f} to {entry.row['f1_high']:.3f}" if entry.row["episodes"] > 1 else "1 episode"
+        )
+        cells = [escaped(entry.label), f"{entry.f1:.3f}", interval]
         cells.append(_difference(entry, entry is group.best))
         cells += [_cell(c.value(group, entry), c.form) for c in shown]
         lines.append("| " + " | ".join(cells) + " |")
