@@ -26,7 +26,7 @@ FAST = {"contract", "arcp", "nsz"}
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
-def draw_background(  # type: ignore[no-untyped-def]
+def draw_background(
     camera, light, look, noise, inverse_depth, spans, shadow, contact, shadow_spans, rgb, depth, instances
 ):
     """Depth and instance of every pixel as if there were no bodies; the colour (H, 3 W) of those that no body hides.
@@ -108,7 +108,7 @@ def draw_background(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
-def _hide(inverse_depth, depth, start, stop):  # type: ignore[no-untyped-def]
+def _hide(inverse_depth, depth, start, stop):
     """Take away the bodies of a row that are behind the ground; returns how many pixels the others hide."""
     one, zero = np.float32(1.0), np.float32(0.0)
     hidden = np.int32(0)
@@ -123,7 +123,7 @@ def _hide(inverse_depth, depth, start, stop):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _next_run(inverse_depth, start, first, last):  # type: ignore[no-untyped-def]
+def _next_run(inverse_depth, start, first, last):
     """The next columns (first, last + 1) to colour; short hidden pieces are coloured too.
 
     Bodies are in the columns first..last - 1 alone.
@@ -144,7 +144,7 @@ def _next_run(inverse_depth, start, first, last):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
-def _ground_depth(iz_0, iz_step, depth):  # type: ignore[no-untyped-def]
+def _ground_depth(iz_0, iz_step, depth):
     """Depth of part of a row of ground."""
     f32 = np.float32
     for c in range(len(depth)):
@@ -152,7 +152,7 @@ def _ground_depth(iz_0, iz_step, depth):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
-def _sky(ray_z, step_z, blue, far, start, n, rgb):  # type: ignore[no-untyped-def]
+def _sky(ray_z, step_z, blue, far, start, n, rgb):
     """n pixels above the horizon, from column `start`; the blue grows with the ray's slope."""
     f32 = np.float32
     for c in range(n):
@@ -164,7 +164,7 @@ def _sky(ray_z, step_z, blue, far, start, n, rgb):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
-def _ground_cells(ray, step, start, eye, depth, fine, coarse):  # type: ignore[no-untyped-def]
+def _ground_cells(ray, step, start, eye, depth, fine, coarse):
     """The cells of the noise tile that part of a row of ground, from column `start`, falls into."""
     f32 = np.float32
     size, mask = np.int32(NOISE_SIZE), np.int32(NOISE_SIZE - 1)
@@ -178,7 +178,7 @@ def _ground_cells(ray, step, start, eye, depth, fine, coarse):  # type: ignore[n
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
-def _ground_shades(noise, depth, fine, coarse, shades):  # type: ignore[no-untyped-def]
+def _ground_shades(noise, depth, fine, coarse, shades):
     """Brightness of ground points about 1; the fine noise fades with distance, before it would flicker."""
     f32 = np.float32
     for c in range(len(depth)):
@@ -187,7 +187,7 @@ def _ground_shades(noise, depth, fine, coarse, shades):  # type: ignore[no-untyp
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
-def _smooth_ground(ray, step, start, eye, noise, depth, shades):  # type: ignore[no-untyped-def]
+def _smooth_ground(ray, step, start, eye, noise, depth, shades):
     """Brightness of part of a row of ground, from column `start`, the noise interpolated where its cells would show."""
     f32 = np.float32
     for c in range(len(depth)):
@@ -207,7 +207,7 @@ def _smooth_ground(ray, step, start, eye, noise, depth, shades):  # type: ignore
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _interpolated(x, y, noise):  # type: ignore[no-untyped-def]
+def _interpolated(x, y, noise):
     """Noise in [-1, 1] at (x, y) cells, both positive."""
     f32 = np.float32
     mask, size, one = np.int32(NOISE_SIZE - 1), np.int32(NOISE_SIZE), np.int32(1)
@@ -221,7 +221,7 @@ def _interpolated(x, y, noise):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
-def _ground_colors(haze, earth, far, shades, depth, rgb):  # type: ignore[no-untyped-def]
+def _ground_colors(haze, earth, far, shades, depth, rgb):
     """Colour of part of a row of ground: its brightness, and the horizon's colour by distance."""
     f32 = np.float32
     for c in range(len(depth)):
@@ -234,7 +234,7 @@ def _ground_colors(haze, earth, far, shades, depth, rgb):  # type: ignore[no-unt
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
-def _shade_ground(row, start, stop, first, from_sky, shadow, contact, shades):  # type: ignore[no-untyped-def]
+def _shade_ground(row, start, stop, first, from_sky, shadow, contact, shades):
     """Darken columns start..stop - 1 of a row of ground, whose shades begin at column `first`."""
     height, width = shadow.shape
     f32 = np.float32
@@ -253,7 +253,7 @@ def _shade_ground(row, start, stop, first, from_sky, shadow, contact, shades):  
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
-def _clouds(ray_x, ray_y, ray_z, step, start, stop, strength, noise, rgb):  # type: ignore[no-untyped-def]
+def _clouds(ray_x, ray_y, ray_z, step, start, stop, strength, noise, rgb):
     """White clouds of noise on a plane high above columns start..stop - 1 of a row of sky; none near the horizon."""
     f32 = np.float32
     mask = np.int32(NOISE_SIZE - 1)

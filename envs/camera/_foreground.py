@@ -21,7 +21,7 @@ PATTERNS = ("plain", "grain", "leaves", "wood", "bricks", "windows", "stripes", 
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
-def draw_foreground(  # type: ignore[no-untyped-def]
+def draw_foreground(
     focal,
     light,
     noise,
@@ -112,7 +112,7 @@ def draw_foreground(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
-def _compose(haze, far, red, green, blue, inverse_depth, depth, rgb):  # type: ignore[no-untyped-def]
+def _compose(haze, far, red, green, blue, inverse_depth, depth, rgb):
     """Depth and final colours of pixels beside each other; clears their inverse depth."""
     one = np.float32(1.0)
     for c in range(len(depth)):
@@ -128,7 +128,7 @@ def _compose(haze, far, red, green, blue, inverse_depth, depth, rgb):  # type: i
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
-def _light_row(row, shadow, contact, spans, sunny, dark):  # type: ignore[no-untyped-def]
+def _light_row(row, shadow, contact, spans, sunny, dark):
     """Share of the sun that reaches flat ground in each pixel of a row, and the darkness about feet."""
     f32 = np.float32
     height, width = shadow.shape
@@ -157,7 +157,7 @@ def _light_row(row, shadow, contact, spans, sunny, dark):  # type: ignore[no-unt
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _brighten_run(row, first, last, triangle, kind, inverse_depth, sunny, dark, bright):  # type: ignore[no-untyped-def]
+def _brighten_run(row, first, last, triangle, kind, inverse_depth, sunny, dark, bright):
     """Brightness of columns first..last - 1, all of one triangle, before any pattern."""
     f32 = np.float32
     one, zero, half = f32(1.0), f32(0.0), f32(0.5)
@@ -176,7 +176,7 @@ def _brighten_run(row, first, last, triangle, kind, inverse_depth, sunny, dark, 
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
-def _pattern_run(row, first, last, triangle, metres, inverse_depth, noise, scratch):  # type: ignore[no-untyped-def]
+def _pattern_run(row, first, last, triangle, metres, inverse_depth, noise, scratch):
     """Multiply the brightness, and set the blueness, of columns first..last - 1, all of one triangle, in `scratch`."""
     f32 = np.float32
     one, zero, half = f32(1.0), f32(0.0), f32(0.5)
@@ -268,20 +268,20 @@ def _pattern_run(row, first, last, triangle, metres, inverse_depth, noise, scrat
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _floor(x):  # type: ignore[no-untyped-def]
+def _floor(x):
     """The floor as float32, for |x| < 2^31, without the library call that `np.floor` makes."""
     whole = np.float32(np.int32(x))
     return whole - np.float32(1.0) if whole > x else whole
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _detail(size, metres):  # type: ignore[no-untyped-def]
+def _detail(size, metres):
     """How much of a detail of `size` m is left where a pixel covers `metres`: 1 near, 0 far."""
     return min(np.float32(1.0), max(np.float32(0.0), np.float32(1.4) - np.float32(1.4) * metres / size))
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _cell(i, j, noise):  # type: ignore[no-untyped-def]
+def _cell(i, j, noise):
     """A number in [-1, 1] for each cell (i, j) of a grid."""
     mask = np.int32(NOISE_SIZE - 1)
     a, b = np.int32(i), np.int32(j)
@@ -290,7 +290,7 @@ def _cell(i, j, noise):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _speck(x, y, noise):  # type: ignore[no-untyped-def]
+def _speck(x, y, noise):
     """Noise in [-1, 1] of the cell that (x, y) falls into."""
     mask, size = np.int32(NOISE_SIZE - 1), np.int32(NOISE_SIZE)
     i, j = np.int32(_floor(x)) & mask, np.int32(_floor(y)) & mask
@@ -298,7 +298,7 @@ def _speck(x, y, noise):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _noise(x, y, noise):  # type: ignore[no-untyped-def]
+def _noise(x, y, noise):
     """Smooth noise in [-1, 1] at (x, y) cells."""
     f32 = np.float32
     mask, size, one = np.int32(NOISE_SIZE - 1), np.int32(NOISE_SIZE), np.int32(1)
@@ -313,7 +313,7 @@ def _noise(x, y, noise):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def mean_colors(fine, rgb):  # type: ignore[no-untyped-def]
+def mean_colors(fine, rgb):
     """Colours (H, W, 3) as the means of blocks of pixels of `fine` (s H, s W, 3)."""
     height, width, _ = rgb.shape
     samples = fine.shape[0] // height

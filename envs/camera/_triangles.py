@@ -31,7 +31,7 @@ FLAT_M = 0.12
 
 
 @njit(cache=True, error_model="numpy")
-def draw_bodies(  # type: ignore[no-untyped-def]
+def draw_bodies(
     geometry,
     body_mesh,
     body_poses,
@@ -193,9 +193,7 @@ def draw_bodies(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def draw_shadows(  # type: ignore[no-untyped-def]
-    geometry, body_mesh, body_poses, look, camera, light, projected, shadow, contact, spans
-):
+def draw_shadows(geometry, body_mesh, body_poses, look, camera, light, projected, shadow, contact, spans):
     """Shadows that the sun casts on the ground into `shadow` (0 or 1), darkness around feet into `contact` (0 to 255).
 
     Both hold zeros and `spans` (width, 0) beforehand. A shadow is the mesh itself, flattened along the sun's rays.
@@ -264,7 +262,7 @@ def draw_shadows(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _draw_contact(extent, pose, strength, camera, projected, polygon, contact, spans):  # type: ignore[no-untyped-def]
+def _draw_contact(extent, pose, strength, camera, projected, polygon, contact, spans):
     """Darken the ground below a body and a margin about its bounding box."""
     low, high = pose[2, 3] + extent[2], pose[2, 3] + extent[5]
     strength *= 1.0 - max(low, 0.0) / 0.3
@@ -322,7 +320,7 @@ def _draw_contact(extent, pose, strength, camera, projected, polygon, contact, s
 
 
 @njit(cache=True, error_model="numpy")
-def _project(vertices, R, t, camera, out):  # type: ignore[no-untyped-def]
+def _project(vertices, R, t, camera, out):
     """Camera coordinates and pixels (5, v) of a body's vertices (3, v); pixels count beyond the near plane only."""
     fx, fy, cx, cy, offset_u, offset_v = camera[12], camera[13], camera[14], camera[15], camera[16], camera[17]
     r00, r01, r02, r10, r11, r12 = R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2]
@@ -341,7 +339,7 @@ def _project(vertices, R, t, camera, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _project_shadow(vertices, pose, slope_x, slope_y, camera, out):  # type: ignore[no-untyped-def]
+def _project_shadow(vertices, pose, slope_x, slope_y, camera, out):
     """Like `_project`, of the vertices' shadows on the ground."""
     p00, p01, p02, p03 = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
     p10, p11, p12, p13 = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
@@ -365,7 +363,7 @@ def _project_shadow(vertices, pose, slope_x, slope_y, camera, out):  # type: ign
 
 
 @njit(cache=True, error_model="numpy")
-def _bounds(body, near, width, height):  # type: ignore[no-untyped-def]
+def _bounds(body, near, width, height):
     """Whether a projected body (5, v) is beyond the near plane, and its first and last column and row in the image.
 
     Part of a body before the near plane may be anywhere.
@@ -381,7 +379,7 @@ def _bounds(body, near, width, height):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _to_camera(x, y, z, camera, projected, k):  # type: ignore[no-untyped-def]
+def _to_camera(x, y, z, camera, projected, k):
     """Camera coordinates and, beyond the near plane, pixel of a world point into row k of `projected`."""
     x, y, z = x - camera[9], y - camera[10], z - camera[11]
     depth = camera[2] * x + camera[5] * y + camera[8] * z
@@ -396,14 +394,14 @@ def _to_camera(x, y, z, camera, projected, k):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _from_sky(nx, ny, nz, up, sun, ambient):  # type: ignore[no-untyped-def]
+def _from_sky(nx, ny, nz, up, sun, ambient):
     """Light a face gets from sky and ground: the sky gives more than the ground, and more on the sun's side."""
     facing_up, facing_sun = nx * up[0] + ny * up[1] + nz * up[2], nx * sun[0] + ny * sun[1] + nz * sun[2]
     return ambient * (0.95 + 0.2 * facing_up + 0.15 * facing_sun)
 
 
 @njit(cache=True, error_model="numpy")
-def _record_brightness(record, normals, dual, vertices, first, up, sun, ambient, R, eye, camera):  # type: ignore[no-untyped-def]
+def _record_brightness(record, normals, dual, vertices, first, up, sun, ambient, R, eye, camera):
     """Brightness of a smooth face, linear between its corners, into fields 5-8 of its record."""
     b0 = _brightness(normals[0], normals[1], normals[2], up, sun, ambient)
     b1 = _brightness(normals[3], normals[4], normals[5], up, sun, ambient) - b0
@@ -416,12 +414,12 @@ def _record_brightness(record, normals, dual, vertices, first, up, sun, ambient,
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _brightness(nx, ny, nz, up, sun, ambient):  # type: ignore[no-untyped-def]
+def _brightness(nx, ny, nz, up, sun, ambient):
     return _from_sky(nx, ny, nz, up, sun, ambient) + (1.0 - ambient) * max(0.0, nx * sun[0] + ny * sun[1] + nz * sun[2])
 
 
 @njit(cache=True, error_model="numpy")
-def _record_affine(record, at, gx, gy, gz, constant, R, eye, camera):  # type: ignore[no-untyped-def]
+def _record_affine(record, at, gx, gy, gz, constant, R, eye, camera):
     """Fields at..at + 3 so that g.p + constant of a body point p is z (f0 column + f1 row + f2) + f3."""
     u = (R[0, 0] * gx + R[0, 1] * gy + R[0, 2] * gz) / camera[12]
     v = (R[1, 0] * gx + R[1, 1] * gy + R[1, 2] * gz) / camera[13]
@@ -433,7 +431,7 @@ def _record_affine(record, at, gx, gy, gz, constant, R, eye, camera):  # type: i
 
 
 @njit(cache=True, error_model="numpy")
-def _side_planes(fx, fy, cx, cy, width, height):  # type: ignore[no-untyped-def]
+def _side_planes(fx, fy, cx, cy, width, height):
     """Unit inward normals (4, 3) of the planes through the camera and the image's left, right, upper and lower edge."""
     sides = np.array(
         [[fx, 0.0, cx], [-fx, 0.0, width - cx], [0.0, fy, cy], [0.0, -fy, height - cy]],
@@ -444,7 +442,7 @@ def _side_planes(fx, fy, cx, cy, width, height):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _in_view(x, y, z, radius, sides, near):  # type: ignore[no-untyped-def]
+def _in_view(x, y, z, radius, sides, near):
     """Whether a ball about (x, y, z) of the camera frame may reach into the picture."""
     inside = z + radius >= near
     for i in range(4):
@@ -453,7 +451,7 @@ def _in_view(x, y, z, radius, sides, near):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _project_face(i, j, k, projected, near, fx, fy, cx, cy, offset_u, offset_v, polygon):  # type: ignore[no-untyped-def]
+def _project_face(i, j, k, projected, near, fx, fy, cx, cy, offset_u, offset_v, polygon):
     """Put the corners (u, v) of face (i, j, k), cut at the near plane, into `polygon`; returns how many: 0, 3 or 4."""
     in_i, in_j, in_k = projected[2, i] >= near, projected[2, j] >= near, projected[2, k] >= near
     if in_i and in_j and in_k:
@@ -482,7 +480,7 @@ def _project_face(i, j, k, projected, near, fx, fy, cx, cy, offset_u, offset_v, 
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _edges(x0, y0, x1, y1, x2, y2, width, height):  # type: ignore[no-untyped-def]
+def _edges(x0, y0, x1, y1, x2, y2, width, height):
     """Corners from top to bottom, slopes du/dv of the long, upper and lower edge, first and last + 1 row."""
     if y1 < y0:
         x0, y0, x1, y1 = x1, y1, x0, y0
@@ -501,7 +499,7 @@ def _edges(x0, y0, x1, y1, x2, y2, width, height):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _columns(row, x0, y0, x1, y1, long_slope, upper_slope, lower_slope, width):  # type: ignore[no-untyped-def]
+def _columns(row, x0, y0, x1, y1, long_slope, upper_slope, lower_slope, width):
     """First and last + 1 column of a row of a triangle as `_edges` gives it.
 
     A pixel belongs to it if left <= u < right and top <= v < bottom, with each edge evaluated from its upper end:
@@ -515,7 +513,7 @@ def _columns(row, x0, y0, x1, y1, long_slope, upper_slope, lower_slope, width): 
 
 
 @njit(cache=True, error_model="numpy")
-def _fill(x0, y0, x1, y1, x2, y2, iz_u, iz_v, iz_0, number, inverse_depth, triangle_at):  # type: ignore[no-untyped-def]
+def _fill(x0, y0, x1, y1, x2, y2, iz_u, iz_v, iz_0, number, inverse_depth, triangle_at):
     """Fill a triangle whose sample points lie at whole numbers; returns whether any pixel was drawn."""
     height, width = inverse_depth.shape
     x0, y0, x1, y1, long_slope, upper, lower, first, last = _edges(x0, y0, x1, y1, x2, y2, width, height)
@@ -538,7 +536,7 @@ def _fill(x0, y0, x1, y1, x2, y2, iz_u, iz_v, iz_0, number, inverse_depth, trian
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _fill_run(base, iz_u, left, right, row, number, inverse_depth, triangle_at):  # type: ignore[no-untyped-def]
+def _fill_run(base, iz_u, left, right, row, number, inverse_depth, triangle_at):
     """A long run of a row's pixels: no branches and no indices that might be negative, so it becomes vector code."""
     drawn = np.int32(0)
     number = np.int32(number)
@@ -553,7 +551,7 @@ def _fill_run(base, iz_u, left, right, row, number, inverse_depth, triangle_at):
 
 
 @njit(cache=True, error_model="numpy")
-def _fill_mask(x0, y0, x1, y1, x2, y2, mask):  # type: ignore[no-untyped-def]
+def _fill_mask(x0, y0, x1, y1, x2, y2, mask):
     """Set the pixels of a triangle to 1."""
     height, width = mask.shape
     x0, y0, x1, y1, long_slope, upper, lower, first, last = _edges(x0, y0, x1, y1, x2, y2, width, height)
@@ -564,9 +562,7 @@ def _fill_mask(x0, y0, x1, y1, x2, y2, mask):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _fill_contact(  # type: ignore[no-untyped-def]
-    x0, y0, x1, y1, x2, y2, maps, eye_x, eye_y, half_x, half_y, margin, strength, contact, spans
-):
+def _fill_contact(x0, y0, x1, y1, x2, y2, maps, eye_x, eye_y, half_x, half_y, margin, strength, contact, spans):
     """Darken the pixels of a triangle on the ground by their distance from the rectangle of these half sides."""
     height, width = contact.shape
     x0, y0, x1, y1, long_slope, upper, lower, first, last = _edges(x0, y0, x1, y1, x2, y2, width, height)
