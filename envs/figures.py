@@ -25,16 +25,17 @@ def sums(result: StepScore) -> NDArray[np.float64]:
 
 
 def figures(sums: NDArray[np.float64], prefix: str) -> dict[str, float]:
-    correct, retrieved, common, visible, single, fused, localized = sums
+    """One robot's sums (7,) as infos' figures; ratios and means of nothing are 0."""
+    correct, retrieved, common, visible, single, fused, localized = sums.tolist()
     return {
-        f"{prefix}n_correct": float(correct),
-        f"{prefix}n_retrieved": float(retrieved),
-        f"{prefix}n_covisible": float(common),
-        f"{prefix}n_visible": float(visible),
-        f"{prefix}precision": float(correct / retrieved) if retrieved else 0.0,
-        f"{prefix}recall": float(correct / common) if common else 0.0,
-        f"{prefix}scene_recall": float(correct / visible) if visible else 0.0,
-        f"{prefix}n_localized": float(localized),
-        f"{prefix}displacement_single_m": float(single / localized) if localized else 0.0,
-        f"{prefix}displacement_fused_m": float(fused / localized) if localized else 0.0,
+        f"{prefix}n_correct": correct,
+        f"{prefix}n_retrieved": retrieved,
+        f"{prefix}n_covisible": common,
+        f"{prefix}n_visible": visible,
+        f"{prefix}precision": correct / retrieved if retrieved else 0.0,
+        f"{prefix}recall": correct / common if common else 0.0,
+        f"{prefix}scene_recall": correct / visible if visible else 0.0,
+        f"{prefix}n_localized": localized,
+        f"{prefix}displacement_single_m": single / localized if localized else 0.0,
+        f"{prefix}displacement_fused_m": fused / localized if localized else 0.0,
     }
