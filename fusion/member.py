@@ -88,7 +88,6 @@ class MemberOptions:
     Attributes:
         gain: how measurements are weighed, see `fuse`.
         gate: share of honest measurements to keep in each group; None = keep all.
-        trust_own: the gate leaves out what disagrees with the own measurement, not what disagrees with most.
         least_agreement: a partner whose measurements pass the gate less often than this, over the last frames, is left
             out altogether; 0 = never.
         own_time: fuse a report with what was seen at its own time; False = with what is seen when it arrives.
@@ -101,7 +100,6 @@ class MemberOptions:
 
     gain: Gain = "covariance"
     gate: float | None = 0.999
-    trust_own: bool = False
     least_agreement: float = 0.6
     own_time: bool = True
     filter_pose: bool = True
@@ -281,7 +279,6 @@ class Member:
             frame=me,
             gain=o.gain,
             gate=o.gate,
-            trust_own=o.trust_own,
             frame_covariance=own.covariance,
         )
 
