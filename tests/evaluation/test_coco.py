@@ -94,6 +94,6 @@ def test_what_cannot_be_exported_is_said(small_dataset, recorded, tmp_path):
     objects = pq.read_table(recorded / "objects.parquet").to_pylist()
     objects[2]["class"] = "green"
     pq.write_table(pa.Table.from_pylist(objects), folder / "objects.parquet")
-    with pytest.raises(DatasetError, match=r"column 'class', row 2: 'green' is not one of red, blue"):
+    with pytest.raises(DatasetError, match=r"column 'class', row 2: 'green' is none of the classes red, blue"):
         export_coco(folder, tmp_path / "green")
     assert not (tmp_path / "green" / "annotations.json").exists()

@@ -159,7 +159,7 @@ def test_interrupted_recordings_end_the_same(recorded, tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         record(SCENE, SETTINGS, folder)
     monkeypatch.undo()
-    with pytest.raises(DatasetError, match=r"dataset.json is missing"):
+    with pytest.raises(DatasetError, match=r"is an unfinished recording: go on with covis record --resume"):
         load_dataset(folder)
     with pytest.raises(DatasetError, match=r"unfinished recording \(1 whole episodes\)"):
         check(folder)
