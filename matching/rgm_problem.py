@@ -16,6 +16,8 @@ from .uncertainty import certainty, kronecker_plus, typical
 
 UNIT_MEDIANS = 6.0
 """Unit of V and of U in the uncertainty regulariser, in medians over the candidates."""
+LEAST_WEIGHT = 1e-300
+"""Of Eq. (18): a weight of 0 would leave nothing to choose from once only hopeless objects are left."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +150,7 @@ def build(
     )
     uncertainty = source.attribute_variance / width.attribute_unit + source.position_variance / width.position_unit_m2
     # What the objects have in common, Eq. (18) loses when it is normalised over them.
-    weight = np.exp(-(uncertainty - uncertainty.min()) / proposal_width)
+    weight = np.maximum(np.exp(-(uncertainty - uncertainty.min()) / proposal_width), LEAST_WEIGHT)
     return Problem(terms, table, table_pi, support(terms), weight)
 
 

@@ -333,6 +333,18 @@ def test_objects_of_unknown_variance_are_not_matched():
     assert 3 not in found.pairs[:, 0]
 
 
+@pytest.mark.parametrize("acceptance", ["paper", "metropolis"])
+def test_objects_of_hopeless_variance_do_not_end_the_chain(acceptance):
+    source, target, _ = scene(np.random.default_rng(6))
+    u = source.position_variance.copy()
+    u[:2] *= 1e9
+    hopeless = ObjectGraph.from_positions(source.positions, position_variance=u)
+    for seed in range(5):
+        # Nothing but these two is left to choose from once the chain has taken in everything else.
+        found = rgm_no_uncertainty(hopeless, target, acceptance=acceptance, rng=np.random.default_rng(seed))
+        assert np.isfinite(found.scores).all()
+
+
 def test_too_many_objects_are_refused_with_the_limit():
     big = ObjectGraph.from_positions(np.zeros((65, 3)))
     with pytest.raises(ValueError, match="rgm accepts at most 64 objects a side, target has 65"):
