@@ -60,7 +60,7 @@ def up_in_camera(T_world_camera: Array) -> Array:
 
 
 @njit(cache=True)
-def _reported(T, position_m, heading_rad, normal):  # type: ignore[no-untyped-def]
+def _reported(T: Array, position_m: float, heading_rad: float, normal: Array) -> Array:
     """A pose (4, 4) with errors drawn as standard normal numbers (4,), of the position and about the vertical.
 
     The error is a right perturbation of the report, truth = reported * exp(xi), as the covariance is understood.
@@ -78,7 +78,7 @@ def _reported(T, position_m, heading_rad, normal):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True)
-def _travelled(T_last, T_now, position, heading_rad, normal):  # type: ignore[no-untyped-def]
+def _travelled(T_last: Array, T_now: Array, position: float, heading_rad: float, normal: Array) -> Array:
     """The pose (4, 4) of the present in the last frame, the motion's errors drawn as `_reported` takes them."""
     motion, moved = np.empty((3, 3)), np.empty(3)
     for i in range(3):
@@ -101,7 +101,7 @@ def _travelled(T_last, T_now, position, heading_rad, normal):  # type: ignore[no
 
 
 @njit(cache=True)
-def _rotation(x, y, z):  # type: ignore[no-untyped-def]
+def _rotation(x: float, y: float, z: float) -> Array:
     """`matching.pose.rotation_from_vector` of (x, y, z)."""
     angle = sqrt(x * x + y * y + z * z)
     s, c = (1.0, 0.5) if angle < 1e-8 else (sin(angle) / angle, (1.0 - cos(angle)) / angle**2)

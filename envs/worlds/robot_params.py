@@ -122,8 +122,8 @@ def _check_field(name: str, kind: str, value: object) -> None:
         number, what = (_whole, "whole numbers") if kind != "Range" else (_finite, "finite numbers")
         pair = isinstance(value, tuple) and len(value) == 2 and all(map(number, value)) and value[0] <= value[1]
         require(pair, name, value, f"a pair (low, high) of {what} with low <= high")
-        if not name.endswith("_deg"):
-            require(value[0] >= 0, name, value, "a pair of non-negative numbers")  # type: ignore[index]
+        if isinstance(value, tuple) and not name.endswith("_deg"):
+            require(value[0] >= 0, name, value, "a pair of non-negative numbers")
 
 
 def _finite(value: object) -> bool:
