@@ -119,7 +119,8 @@ def row(target: PerceptionTarget, found: Tally) -> dict[str, Any]:
         "u_mean_m2": _mean(u),
         "v_mean": _mean(found.of("v")),
         "squared_error_mean_m2": _mean(squared),
-        "lateral_mean_m": _mean(found.of("lateral")),
+        "lateral_mean_m": _mean(np.linalg.norm(found.of("offset").reshape(-1, 3)[:, 1:], axis=1)),
+        **consistency(found),
         "milliseconds": float(np.median(found.milliseconds)) if found.milliseconds else None,
     }
 
@@ -149,6 +150,23 @@ def ence(variance: Array, squared_error: Array, bins: int = ENCE_BINS) -> float 
     rmv = np.sqrt([variance[p].mean() for p in parts])
     rmse = np.sqrt([squared_error[p].mean() for p in parts])
     return float(np.mean(np.abs(rmv - rmse) / np.maximum(rmv, 1e-12)))
+
+
+def consistency(found: Tally) -> dict[str, float | None]:
+    """NEES per degree of freedom, 1 where covariances are true, of all detections that the environment would tie.
+
+    By axis, of all three, and without the hundredth of the objects that have the largest: errors have heavier tails
+    than a Gaussian.
+    """
+    names = ("nees_along", "nees_horizontal", "nees_vertical")
+    normalised = found.of("offset", every=True).reshape(-1, 3) ** 2
+    if len(normalised) == 0:
+        return dict.fromkeys((*names, "nees", "nees_without_1_percent"))
+    normalised = normalised / found.of("variances", every=True)
+    whole = np.sort(normalised.mean(axis=1))
+    least = whole[: max(round(0.99 * len(whole)), 1)]
+    by_axis = dict(zip(names, normalised.mean(axis=0).tolist(), strict=True))
+    return by_axis | {"nees": float(whole.mean()), "nees_without_1_percent": float(least.mean())}
 
 
 def shift(known: Tally, strange: Tally) -> dict[str, float | None]:
@@ -200,6 +218,7 @@ def table_columns() -> Iterable[tuple[str, str]]:
         ("depth_spearman_exact", "rho exact"),
         ("depth_only_spearman", "rho(z)"),
         ("ence", "ENCE"),
+        ("nees", "NEES"),
         ("u_ratio_matched", "u ratio"),
         ("v_ratio_matched", "v ratio"),
         ("squared_error_ratio_matched", "e² ratio"),

@@ -20,23 +20,30 @@ if TYPE_CHECKING:
 
 MIN_PIXELS = 60
 MIN_IOU = 0.5
+MIN_DEPTH_M = 0.2
 
 
 @dataclass
 class Tally:
-    """What was found over many images; one entry per pair of a detection and its true object in the lists of arrays.
+    """What was found over many images.
+
+    The lists of arrays have one entry per detection that meets a true object: those whose mask does, and those whose
+    box does, as the environment ties them. The former count in the figures, where their object is large enough.
 
     Attributes:
         objects: number of true objects that count.
-        detections: number of detections; `true_detections` of them meet a true object, however small.
+        detections: number of detections; `true_detections` of them meet a true object by their mask, however small.
+        counts: (k,) whether the entry counts in the figures.
         right_class: (k,) whether the most probable class is the true one.
         error: (k,) m, estimated minus true distance.
         distance, true_distance: (k,) m.
-        lateral: (k,) m, distance of the true centre from the estimated viewing ray.
-        u, v: (k,) reported uncertainties; across (k,) m^2, reported variance per axis across the viewing ray.
+        depth_ratio: (k,) estimated over true depth.
+        offset: (k, 3) m, true minus estimated position along the viewing ray and across it, to the right and down.
+        variances: (k, 3) m^2, reported variances of these.
+        u, v: (k,) reported uncertainties.
         attributes, true_class: (k, c), (k,).
         size: (k,) visible pixels.
-        known: (k, VARIANCE_TERMS) `variance_features` of the reported variances.
+        features: (k, TERMS) of which the calibration is a function.
         milliseconds: per image.
     """
 
@@ -44,26 +51,30 @@ class Tally:
     detections: int = 0
     true_detections: int = 0
     images: int = 0
+    counts: list[NDArray[np.bool_]] = field(default_factory=list)
     right_class: list[Array] = field(default_factory=list)
     error: list[Array] = field(default_factory=list)
     distance: list[Array] = field(default_factory=list)
     true_distance: list[Array] = field(default_factory=list)
     depth_ratio: list[Array] = field(default_factory=list)
-    lateral: list[Array] = field(default_factory=list)
+    offset: list[Array] = field(default_factory=list)
+    variances: list[Array] = field(default_factory=list)
     u: list[Array] = field(default_factory=list)
     v: list[Array] = field(default_factory=list)
-    across: list[Array] = field(default_factory=list)
     attributes: list[Array] = field(default_factory=list)
     true_class: list[NDArray[np.int64]] = field(default_factory=list)
     size: list[Array] = field(default_factory=list)
-    known: list[Array] = field(default_factory=list)
+    features: list[Array] = field(default_factory=list)
     milliseconds: list[float] = field(default_factory=list)
     coco: CocoRecords = field(default_factory=lambda: CocoRecords())
 
-    def of(self, name: str) -> Array:
-        """All entries of one list as one array."""
+    def of(self, name: str, *, every: bool = False) -> Array:
+        """The entries of one list that count as one array; `every` = also those that do not."""
         parts = getattr(self, name)
-        return np.concatenate(parts) if parts else np.zeros(0)
+        if not parts:
+            return np.zeros(0)
+        values = np.concatenate(parts)
+        return values if every else values[np.concatenate(self.counts)]
 
 
 def tally(
@@ -95,6 +106,9 @@ def tally(
 
 def count(out: Tally, image: Image, seen: Seen, score: float) -> None:
     """Add one image's detections to a tally; those below `score` count for AP alone."""
+    from ..agents.perception.detections import ray_frames
+    from ..envs.scoring import tie, tight_boxes
+
     masks = seen.detections.masks
     assert masks is not None
     out.images += 1
@@ -106,7 +120,10 @@ def count(out: Tally, image: Image, seen: Seen, score: float) -> None:
     out.detections += len(sure)
     partner = match_masks(masks[sure], image.instances, image.pixels)
     out.true_detections += int((partner >= 0).sum())
-    hit = (partner >= 0) & (wanted[partner] if len(wanted) else False) & (image.centres[partner, 2] > 0.2)
+    counted = (partner >= 0) & (wanted[partner] if len(wanted) else False)
+    boxes, visible = tight_boxes(image.instances, len(image.pixels))
+    partner = np.where(counted, partner, tie(seen.detections.boxes[sure], boxes, visible))
+    hit = (partner >= 0) & (image.centres[partner, 2] > MIN_DEPTH_M if len(wanted) else False)
     found, true = sure[hit], partner[hit]
     if len(found) == 0:
         return
@@ -114,30 +131,21 @@ def count(out: Tally, image: Image, seen: Seen, score: float) -> None:
     centres = image.centres[true]
     distance = np.linalg.norm(graph.positions, axis=1)
     true_distance = np.linalg.norm(centres, axis=1)
-    ray = graph.positions / distance[:, None]
-    across = centres - ray * (centres * ray).sum(axis=1, keepdims=True)
+    frames = ray_frames(graph.positions)
+    out.counts.append(counted[hit])
     out.right_class.append(graph.attributes.argmax(axis=1) == image.object_class[true])
     out.error.append(distance - true_distance)
     out.distance.append(distance)
     out.true_distance.append(true_distance)
     out.depth_ratio.append(graph.positions[:, 2] / centres[:, 2])
-    out.lateral.append(np.linalg.norm(across, axis=1))
+    out.offset.append(np.einsum("nki,ni->nk", frames, centres - graph.positions))
+    out.variances.append(np.einsum("nki,nij,nkj->nk", frames, graph.full_covariances(), frames))
     out.u.append(graph.position_variance)
     out.v.append(graph.attribute_variance)
-    covariances = graph.full_covariances()
-    out.across.append(0.5 * (np.trace(covariances, axis1=1, axis2=2) - graph.position_variance))
     out.attributes.append(graph.attributes)
     out.true_class.append(image.object_class[true])
-    out.known.append(_known(seen, found))
+    out.features.append(seen.features[found])
     out.size.append(image.pixels[true].astype(np.float64))
-
-
-def _known(seen: Seen, found: NDArray[np.int64]) -> Array:
-    from ..agents.perception.weights import variance_features
-
-    variance, depth = seen.depth_variance[found], seen.depth[found]
-    share = seen.depth_epistemic[found] / variance
-    return variance_features(variance / depth**2, share, seen.scores[found], depth, seen.pixels[found])
 
 
 def match_masks(masks: NDArray[np.bool_], instances: NDArray[np.int32], pixels: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from ..agents.perception.weights import Calibration, Weights
 
 FIGURES = ("ap50", "class_accuracy", "depth_abs_rel", "depth_spearman", "ence")
-MEDIAN_CHI_SQUARED_2 = 2 * np.log(2)
 SMALLEST_TALLY = 30
 RIDGE = 0.001
 SMALLEST_ERROR = 0.01
+SMALLEST_RATIO = 0.05
 
 
 def known_targets() -> list[PerceptionTarget]:
@@ -49,12 +49,33 @@ def finish(state: State, params: TrainingParams, out: Path, images: int) -> Weig
     """Calibrate the averaged network of a training on `images` validation images a scene, and save it in `out`."""
     from ..agents.perception import weights as stored
 
-    weights = _weights(state.averaged)
-    if images:
-        weights = replace(weights, calibration=calibrate([found for _, found in _tallies(weights, images, 1)]))
-    weights = replace(weights, notes=training_notes(state, params) | {"calibration_images_per_scene": images})
+    weights = _calibrated(replace(_weights(state.averaged), notes=training_notes(state, params)), images)
     stored.save(weights, out)
     return weights
+
+
+def recalibrate(folder: Path, images: int) -> Weights:
+    """Fit the calibration of the weights in a folder anew, on `images` validation images a scene, and store it there.
+
+    Raises:
+        WeightsError: no weights, altered ones, or of a format whose tensors are others.
+        ValueError: no images.
+    """
+    from ..agents.perception import weights as stored
+
+    if images < 1:
+        raise ValueError(f"calibration needs at least 1 image a scene, got {images}")
+    weights = _calibrated(stored.load(folder, calibrated=False), images)
+    stored.save(weights, folder)
+    return weights
+
+
+def _calibrated(weights: Weights, images: int) -> Weights:
+    notes = dict(weights.notes) | {"calibration_images_per_scene": images}
+    if not images:
+        return replace(weights, notes=notes)
+    calibration = calibrate([found for _, found in _tallies(weights, images, 1)])
+    return replace(weights, calibration=calibration, notes=notes)
 
 
 def training_notes(state: State, params: TrainingParams) -> dict[str, Any]:
@@ -72,66 +93,66 @@ def training_notes(state: State, params: TrainingParams) -> dict[str, Any]:
 def calibrate(tallies: Sequence[Tally]) -> Calibration:
     """Corrections of depth and variances, and the class temperature, that fit what uncalibrated eyes saw.
 
-    Scenes count alike. The correction of the depth has the least absolute logarithmic error; the correction of its
-    variance makes the errors most likely, see `_variance_correction`; the factor on the centre's variance makes the
-    median of the squared lateral error that of two Gaussian axes; the temperature has the least negative log-likelihood
-    of the true classes. Scenes with too few detections are left out.
+    Of all detections that meet a true object, scenes counting alike; those with too few detections are left out. The
+    correction of the depth has the least absolute logarithmic error; those of the variances make the errors most
+    likely, see `_variance_correction`; the temperature has the least negative log-likelihood of the true classes.
     """
     from ..agents.perception.weights import Calibration
 
-    used = [t for t in tallies if len(t.of("u")) >= SMALLEST_TALLY]
+    used = [t for t in tallies if len(t.of("u", every=True)) >= SMALLEST_TALLY]
     if not used:
         return Calibration()
-    scale, exponent = _depth_correction([t.of("distance") for t in used], [t.of("depth_ratio") for t in used])
-    corrected = [scale * t.of("distance") ** exponent for t in used]
-    squared = [(d - t.of("true_distance")) ** 2 for t, d in zip(used, corrected, strict=True)]
-    ratios = [e / (t.of("u") * (d / t.of("distance")) ** 2) for t, d, e in zip(used, corrected, squared, strict=True)]
-    lateral = [np.median(t.of("lateral") ** 2 / t.of("across")) / MEDIAN_CHI_SQUARED_2 for t in used]
+    share = np.concatenate([np.full(n, 1 / (n * len(used))) for n in (len(t.of("u", every=True)) for t in used)])
+    names = ("features", "distance", "offset", "variances")
+    features, distance, offset, variances = (np.concatenate([t.of(name, every=True) for t in used]) for name in names)
+    depth = _depth_correction(features, np.log(np.maximum(1 + offset[:, 0] / distance, SMALLEST_RATIO)), share)
+    factor = np.exp(features @ depth)
+    offset[:, 0] += (1 - factor) * distance
+    ratios = offset**2 / (variances * factor[:, None] ** 2)
+    along, horizontal, vertical = (_variance_correction(features, ratio, share) for ratio in ratios.T)
     temperatures = np.exp(np.linspace(np.log(0.3), np.log(3), 61))
     surprise = [np.mean([_negative_log_likelihood(t, x) for t in used]) for x in temperatures]
     return Calibration(
-        scale=scale,
-        exponent=exponent,
-        depth=_variance_correction([t.of("known") for t in used], ratios),
-        centre=float(np.exp(np.mean(np.log(lateral)))),
+        depth=tuple(depth.tolist()),
+        along=tuple(along.tolist()),
+        horizontal=tuple(horizontal.tolist()),
+        vertical=tuple(vertical.tolist()),
         class_temperature=float(temperatures[int(np.argmin(surprise))]),
     )
 
 
-def _depth_correction(distances: Sequence[Array], ratios: Sequence[Array]) -> tuple[float, float]:
-    """Scale and exponent that bring distances (k,) of each scene nearest to the truth, given their ratios (k,) to it.
+def _depth_correction(features: Array, wanted: Array, share: Array) -> Array:
+    """Coefficients of the features (k, terms) whose sum is nearest to the `wanted` (k,) logarithms of factors.
 
-    Least absolute error of the logarithm, by least squares reweighted.
+    Least absolute error, by least squares reweighted.
     """
-    x, y = np.log(np.concatenate(distances)), -np.log(np.concatenate(ratios))
-    share = np.concatenate([np.full(len(r), 1 / len(r)) for r in ratios])
-    line, weight = np.zeros(2), share
+    penalty = np.diag([0.0, *[RIDGE] * (features.shape[1] - 1)])
+    found, weight = np.zeros(features.shape[1]), share
     for _ in range(50):
-        line = np.polyfit(x, y, 1, w=np.sqrt(weight))
-        weight = share / np.maximum(np.abs(y - np.polyval(line, x)), SMALLEST_ERROR)
-    return float(np.exp(line[1])), float(1 + line[0])
+        weighted = features * weight[:, None]
+        found = np.linalg.solve(features.T @ weighted + weight.sum() * penalty, weighted.T @ wanted)
+        weight = share / np.maximum(np.abs(wanted - features @ found), SMALLEST_ERROR)
+    return found
 
 
-def _variance_correction(known: Sequence[Array], ratios: Sequence[Array]) -> tuple[float, ...]:
-    """Coefficients of the log of the factor on the variance that make the errors of all scenes together most likely.
+def _variance_correction(features: Array, ratio: Array, share: Array) -> Array:
+    """Coefficients (terms,) of the log of the factor on the variance that make Gaussian errors most likely.
 
     Args:
-        known: (k, VARIANCE_TERMS) features of each scene's detections.
-        ratios: (k,) squared errors over reported variances.
+        features: (k, terms).
+        ratio: (k,) squared errors over reported variances.
+        share: (k,) how much each counts.
     """
-    features, ratio = np.concatenate(known), np.concatenate(ratios)
-    weight = np.concatenate([np.full(len(r), 1 / (len(r) * len(ratios))) for r in ratios])
 
     def cost(theta: Array) -> tuple[float, Array]:
         log_factor = np.clip(features @ theta, -20, 20)
         surprise = ratio * np.exp(-log_factor)
-        value = weight @ (log_factor + surprise) + RIDGE * (theta[1:] ** 2).sum()
-        slope = features.T @ (weight * (1 - surprise))
+        value = share @ (log_factor + surprise) + RIDGE * (theta[1:] ** 2).sum()
+        slope = features.T @ (share * (1 - surprise))
         slope[1:] += 2 * RIDGE * theta[1:]
         return float(value), slope
 
-    found = minimize(cost, np.zeros(features.shape[1]), jac=True, method="BFGS")
-    return tuple(float(x) for x in found.x)
+    return np.asarray(minimize(cost, np.zeros(features.shape[1]), jac=True, method="BFGS").x)
 
 
 def _negative_log_likelihood(found: Tally, temperature: float) -> float:

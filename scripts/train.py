@@ -34,6 +34,7 @@ def perception(
     ] = "compact",
     validation_images: Annotated[int, typer.Option(help="Per scene, for figures on the way; 0 = none.")] = 16,
     calibration_images: Annotated[int, typer.Option(help="Per scene, to calibrate uncertainty; 0 = do not.")] = 300,
+    calibrate: Annotated[bool, typer.Option("--calibrate", help="Only calibrate the weights in --out anew.")] = False,
 ) -> None:
     """Learn to see objects, their classes and distances, from frames of the four scenes rendered on the fly.
 
@@ -47,9 +48,13 @@ def perception(
 
         from ..agents.perception.training import train
         from ..agents.perception.training_step import TrainingParams
-        from ..evaluation.perception_training import finish, validation_figures
+        from ..evaluation.perception_training import finish, recalibrate, validation_figures
 
         torch.set_num_threads(1)
+        if calibrate:
+            recalibrate(out, calibration_images)
+            err.print(f"{out / 'eyes.json'}: calibrated on {calibration_images} images a scene", soft_wrap=True)
+            return
         params = TrainingParams(
             minutes=None if steps else minutes, steps=steps, seed=seed, workers=workers, network=network
         )
@@ -60,10 +65,10 @@ def perception(
             validate=(lambda network: validation_figures(network, validation_images)) if validation_images else None,
             report=_print,
         )
-        weights = finish(state, params, out, calibration_images)
+        finish(state, params, out, calibration_images)
     except (ValueError, RuntimeError, FileExistsError) as error:
         fail(error)
-    err.print(f"{out / 'eyes.safetensors'}: {state.step} steps, {state.images} images; {weights.calibration}")
+    err.print(f"{out / 'eyes.safetensors'}: {state.step} steps, {state.images} images", soft_wrap=True)
 
 
 @app.command()

@@ -44,8 +44,20 @@ def rays(pixels: Array, intrinsics: Array) -> Array:
     return np.concatenate([(pixels - centre) / focal, np.ones((len(pixels), 1))], axis=1)
 
 
+def ray_frames(positions: Array) -> Array:
+    """Unit vectors (n, 3, 3), one a row: along the viewing rays of positions (n, 3), and the image's right and down
+    as far as they are across those.
+    """
+    along = positions / np.maximum(np.linalg.norm(positions, axis=1), 1e-9)[:, None]
+    right = np.stack([along[:, 2], np.zeros(len(along)), -along[:, 0]], axis=1)
+    right /= np.maximum(np.linalg.norm(right, axis=1), 1e-9)[:, None]
+    return np.stack([along, right, np.cross(along, right)], axis=1)
+
+
 def ray_covariances(positions: Array, along: Array, across: Array) -> Array:
-    """Covariances (n, 3, 3) m^2 with variance `along` (n,) the viewing ray of positions (n, 3) and `across` (n,) it."""
-    unit = positions / np.maximum(np.linalg.norm(positions, axis=1), 1e-9)[:, None]
-    outer = unit[:, :, None] * unit[:, None, :]
-    return across[:, None, None] * np.eye(3) + (along - across)[:, None, None] * outer
+    """Covariances (n, 3, 3) m^2 with variance `along` (n,) the viewing ray of positions (n, 3) and `across` (n, 2) it,
+    to the image's right and down.
+    """
+    frames = ray_frames(positions)
+    variances = np.concatenate([along[:, None], across], axis=1)
+    return np.einsum("nki,nk,nkj->nij", frames, variances, frames)

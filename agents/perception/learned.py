@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,8 @@ from .network import (
 )
 
 PRECISIONS = ("auto", "bfloat16", "float32")
+LEAST_PIXEL_VARIANCE = 0.05
+"""Of a projected centre per axis before calibration, px^2."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,7 @@ class Seen:
         depth: (n,) m, of each object's centre along the optical axis.
         depth_variance: (n,) m^2 of that, calibrated; the sum of epistemic and aleatoric.
         depth_epistemic: (n,) m^2, the variance between samples, calibrated alike.
+        features: (n, weights.TERMS) of which the calibration is a function.
         milliseconds: time per stage.
     """
 
@@ -93,7 +96,56 @@ class Seen:
     depth: Array
     depth_variance: Array
     depth_epistemic: Array
+    features: Array
     milliseconds: Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One robot's observation, checked.
+
+    Attributes:
+        image: (H, W, 3) uint8.
+        intrinsics: (3, 3).
+        up: (3,) against gravity, camera frame.
+        height, height_std: m, of the camera above the ground, see `camera_height`.
+    """
+
+    image: NDArray[np.uint8]
+    intrinsics: Array
+    up: Array
+    height: float
+    height_std: float
+
+
+@dataclass(frozen=True, eq=False)
+class Objects:
+    """What a network makes of one image before calibration, n objects, best score first.
+
+    Attributes:
+        scores, pixels, masks (n, H, W): see `Seen`.
+        tight: (n, 4) px, boxes of the masks.
+        attributes: (n, c) class distributions, Eq. (6); attribute_variance (n,), section 3.3.1.
+        pixel: (n, 2) where the centre projects to.
+        size: (n, 2) px, width and height of the box that the network gives.
+        centre_variance: (n,) of `pixel` per axis, in squares of the size along it.
+        depth, depth_variance, depth_epistemic: (n,) m and m^2.
+        embedding: (n, e), or None.
+    """
+
+    scores: Array
+    pixels: NDArray[np.int64]
+    masks: NDArray[np.bool_]
+    tight: Array
+    attributes: Array
+    attribute_variance: Array
+    pixel: Array
+    size: Array
+    centre_variance: Array
+    depth: Array
+    depth_variance: Array
+    depth_epistemic: Array
+    embedding: Array | None = None
 
 
 class LearnedPerception:
@@ -157,14 +209,18 @@ class LearnedPerception:
     def see(self, observation: Mapping[str, Any], rng: np.random.Generator) -> Seen:
         """Like calling, with all there is to know."""
         clock = Clock()
-        image = self._checked(observation)
-        rows, columns = image.shape[:2]
-        K, up = finite(observation, "intrinsics", (3, 3)), finite(observation, "up", (3,))
-        height, height_std = (torch.tensor([value]) for value in camera_height(observation))
-        geometry = Geometry.of(torch.from_numpy(K[None]), torch.from_numpy(up[None]), height, height_std)
+        view = self._checked(observation)
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+        seen = self._calibrated(self._objects(view, generator, clock), view)
+        clock.lap("graph")
+        return replace(seen, milliseconds=clock.laps)
 
-        dense = self.network(normalised(torch.from_numpy(image[None])), geometry)
+    def _objects(self, view: View, generator: torch.Generator, clock: Clock) -> Objects:
+        """What the network makes of one image."""
+        rows, columns = view.image.shape[:2]
+        K, up = torch.from_numpy(view.intrinsics[None]), torch.from_numpy(view.up[None])
+        geometry = Geometry.of(K, up, torch.tensor([view.height]), torch.tensor([view.height_std]))
+        dense = self.network(normalised(torch.from_numpy(view.image[None])), geometry)
         clock.lap("backbone")
         found = self._find(dense, geometry, rows, columns)
         clock.lap("masks")
@@ -172,12 +228,64 @@ class LearnedPerception:
         clock.lap("classes")
         depth, variance, epistemic = self._depths(dense, geometry, found, generator)
         clock.lap("depth")
-        graph = self._graph(found, attributes, v, depth, variance, K, up, (columns, rows))
-        clock.lap("graph")
-        detections = Detections(graph, found.tight, found.masks)
-        return Seen(detections, found.scores, found.pixels, depth, variance, epistemic, clock.laps)
+        size = (found.boxes[:, 2:] - found.boxes[:, :2]).clamp(min=2.0)
+        return Objects(
+            scores=found.scores,
+            pixels=found.pixels,
+            masks=found.masks,
+            tight=found.tight,
+            attributes=attributes,
+            attribute_variance=v,
+            pixel=(found.at + found.centre * size).double().numpy(),
+            size=size.double().numpy(),
+            centre_variance=np.exp(found.centre_log_variance.double().numpy()),
+            depth=depth,
+            depth_variance=variance,
+            depth_epistemic=epistemic,
+            embedding=found.embedding.double().numpy(),
+        )
 
-    def _checked(self, observation: Mapping[str, Any]) -> NDArray[np.uint8]:
+    def _calibrated(self, found: Objects, view: View) -> Seen:
+        """Depths and uncertainties as validation scenes have shown that they should be."""
+        features = stored.calibration_features(
+            depth=found.depth,
+            depth_variance=found.depth_variance,
+            depth_epistemic=found.depth_epistemic,
+            centre_variance=found.centre_variance,
+            confidence=found.scores,
+            size=found.size,
+        )
+        nearer, along, *axes = self.calibration.factors(features).T
+        depth, factor = found.depth * nearer, along * nearer**2
+        ray = rays(found.pixel, view.intrinsics)
+        positions = ray * depth[:, None]
+        u = factor * found.depth_variance * (ray**2).sum(axis=1)  # of the distance along the ray
+        pixel_variance = np.maximum(found.centre_variance[:, None] * found.size**2, LEAST_PIXEL_VARIANCE)
+        across = (depth[:, None] / view.intrinsics[(0, 1), (0, 1)]) ** 2 * pixel_variance * np.stack(axes, axis=1)
+        graph = ObjectGraph(
+            positions=positions,
+            attributes=found.attributes,
+            position_variance=u,
+            attribute_variance=found.attribute_variance,
+            covariances=ray_covariances(positions, u, across),
+            up=view.up / np.linalg.norm(view.up),
+            forward=np.array([0.0, 0.0, 1.0]),
+            embedding=found.embedding,
+            intrinsics=view.intrinsics,
+            image_size=(view.image.shape[1], view.image.shape[0]),
+        )
+        return Seen(
+            detections=Detections(graph, found.tight, found.masks),
+            scores=found.scores,
+            pixels=found.pixels,
+            depth=depth,
+            depth_variance=factor * found.depth_variance,
+            depth_epistemic=factor * found.depth_epistemic,
+            features=features,
+            milliseconds={},
+        )
+
+    def _checked(self, observation: Mapping[str, Any]) -> View:
         if "image" not in observation:
             raise ValueError('learned perception needs the observation\'s "image": make the environment with it')
         image = np.asarray(observation["image"])
@@ -188,7 +296,8 @@ class LearnedPerception:
             raise ValueError(f"image must be {self.image_size[0]}x{self.image_size[1]} pixels, got {width}x{height}")
         if width < 64 or height < 64 or width % FINE_STRIDE**2 or height % FINE_STRIDE**2:
             raise ValueError(f"image sides must be multiples of 4 and at least 64 pixels, got {width}x{height}")
-        return np.ascontiguousarray(image)
+        K, up = finite(observation, "intrinsics", (3, 3)), finite(observation, "up", (3,))
+        return View(np.ascontiguousarray(image), K, up, *camera_height(observation))
 
     def _find(self, dense: DenseFeatures, geometry: Geometry, height: int, width: int) -> _Found:
         """Objects with their masks, the better of two claims to one thing kept."""
@@ -252,50 +361,15 @@ class LearnedPerception:
         box = found.boxes[:, None].expand(n, D, 4).reshape(-1, 4)
         seen = depth_features(dense, geometry, image, pixels.reshape(-1, 2), box)
         log_depth, log_variance = self.network.depth(seen, T > 1, generator, draws=T)
-        return self._summarised(
-            log_depth.view(T, n, D), log_variance.view(T, n, D), float(geometry.focal[0]), found.scores, found.pixels
-        )
+        return depth_uncertainty(log_depth.view(T, n, D), log_variance.view(T, n, D), float(geometry.focal[0]))
 
-    def _summarised(
-        self, log_depth: Tensor, log_variance: Tensor, focal: float, scores: Array, pixels: NDArray[np.int64]
-    ) -> tuple[Array, Array, Array]:
-        """Depth (n,), its variance and the epistemic part of that, calibrated, of samples (T, n, pixels)."""
-        z = focal / REFERENCE_FOCAL_PX * torch.exp(log_depth.double())
-        z = self.calibration.scale * z**self.calibration.exponent
-        depth = z.mean((0, 2)).numpy()
-        aleatoric = (z**2 * torch.exp(log_variance.double())).mean((0, 2)).numpy()
-        epistemic = z.var(0, unbiased=False).mean(1).numpy()
-        variance = aleatoric + epistemic
-        known = stored.variance_features(variance / depth**2, epistemic / variance, scores, depth, pixels)
-        factor = self.calibration.variance_factor(known)
-        return depth, factor * variance, factor * epistemic
 
-    def _graph(
-        self,
-        found: _Found,
-        attributes: Array,
-        v: Array,
-        depth: Array,
-        depth_variance: Array,
-        K: Array,
-        up: Array,
-        image_size: tuple[int, int],
-    ) -> ObjectGraph:
-        size = (found.boxes[:, 2:] - found.boxes[:, :2]).clamp(min=2.0)
-        pixel = (found.at + found.centre * size).double().numpy()
-        pixel_variance = np.exp(found.centre_log_variance.double().numpy()) * (size.double().numpy() ** 2).mean(axis=1)
-        return graph_of(
-            pixel=pixel,
-            pixel_variance=pixel_variance * self.calibration.centre,
-            depth=depth,
-            depth_variance=depth_variance,
-            attributes=attributes,
-            attribute_variance=v,
-            intrinsics=K,
-            up=up,
-            image_size=image_size,
-            embedding=found.embedding.double().numpy(),
-        )
+def depth_uncertainty(log_depth: Tensor, log_variance: Tensor, focal: float) -> tuple[Array, Array, Array]:
+    """Depth (n,) m, its variance (n,) m^2, section 3.3.2, and the epistemic part of that, of samples (T, n, pixels)."""
+    z = focal / REFERENCE_FOCAL_PX * torch.exp(log_depth.double())
+    aleatoric = (z**2 * torch.exp(log_variance.double())).mean((0, 2)).numpy()
+    epistemic = z.var(0, unbiased=False).mean(1).numpy()
+    return z.mean((0, 2)).numpy(), aleatoric + epistemic, epistemic
 
 
 def class_uncertainty(logits: Tensor, temperature: float) -> tuple[Array, Array]:
@@ -305,41 +379,6 @@ def class_uncertainty(logits: Tensor, temperature: float) -> tuple[Array, Array]
     epistemic = p.var(axis=0)
     aleatoric = (p * (1 - p)).mean(axis=0)
     return mean / mean.sum(axis=1, keepdims=True), (epistemic + aleatoric).mean(axis=1)
-
-
-def graph_of(
-    *,
-    pixel: Array,
-    pixel_variance: Array,
-    depth: Array,
-    depth_variance: Array,
-    attributes: Array,
-    attribute_variance: Array,
-    intrinsics: Array,
-    up: Array,
-    image_size: tuple[int, int],
-    embedding: Array | None = None,
-) -> ObjectGraph:
-    """The graph of n objects whose centres project to `pixel` (n, 2), at `depth` (n,) m along the optical axis.
-
-    `pixel_variance` (n,) px^2 is per axis; `depth_variance` (n,) m^2.
-    """
-    ray = rays(pixel, intrinsics)
-    positions = ray * depth[:, None]
-    u = depth_variance * (ray**2).sum(axis=1)  # of the distance along the ray
-    across = (depth / intrinsics[0, 0]) ** 2 * np.maximum(pixel_variance, 0.05)
-    return ObjectGraph(
-        positions=positions,
-        attributes=attributes,
-        position_variance=u,
-        attribute_variance=attribute_variance,
-        covariances=ray_covariances(positions, u, across),
-        up=up / np.linalg.norm(up),
-        forward=np.array([0.0, 0.0, 1.0]),
-        embedding=embedding,
-        intrinsics=intrinsics,
-        image_size=image_size,
-    )
 
 
 def finite(observation: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Array:

@@ -25,8 +25,7 @@ from torchvision.ops import batched_nms, clip_boxes_to_image
 from ...matching.pose import Array
 from . import weights as stored
 from .decode import spread_pixels, tight_boxes
-from .detections import Detections
-from .learned import Clock, LearnedPerception, Seen, class_uncertainty, finite, graph_of
+from .learned import Clock, LearnedPerception, Objects, View, class_uncertainty, depth_uncertainty
 from .losses import Batch, LossWeights, gaussian_loss
 from .network import REFERENCE_FOCAL_PX, bilinear, dropout
 
@@ -206,36 +205,31 @@ class MaskRCNNPerception(LearnedPerception):
         network.load_state_dict(dict(weights.tensors))
         return network.eval().requires_grad_(False)
 
-    @torch.inference_mode()
-    def see(self, observation: Mapping[str, Any], rng: np.random.Generator) -> Seen:
-        """Like calling, with all there is to know."""
-        clock = Clock()
-        image = self._checked(observation)
-        height, width = image.shape[:2]
-        K, up = finite(observation, "intrinsics", (3, 3)), finite(observation, "up", (3,))
-        generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
-        pixels = torch.from_numpy(image).permute(2, 0, 1).float() / 255
-        found = self._detect(pixels, generator)
+    def _objects(self, view: View, generator: torch.Generator, clock: Clock) -> Objects:
+        pixels = torch.from_numpy(view.image).permute(2, 0, 1).float() / 255
+        scores, masks, attributes, v = self._detect(pixels, generator)
+        tight, visible = tight_boxes(masks), masks.sum(axis=(1, 2))
         clock.lap("objects")
-        z, variance, epistemic = self._object_depths(pixels, found, float(K[0, 0]), generator)
+        at = torch.from_numpy(spread_pixels(masks, visible, tight, self.params.depth_pixels))
+        depth, variance, epistemic = self._object_depths(pixels, at, float(view.intrinsics[0, 0]), generator)
         clock.lap("depth")
-        size = found.tight[:, 2:] - found.tight[:, :2]
-        graph = graph_of(
-            pixel=_centroids(found.masks),
-            pixel_variance=self.calibration.centre * CENTRE_STD**2 * (size**2).mean(axis=1),
-            depth=z,
+        return Objects(
+            scores=scores,
+            pixels=visible,
+            masks=masks,
+            tight=tight,
+            attributes=attributes,
+            attribute_variance=v,
+            pixel=_centroids(masks),
+            size=tight[:, 2:] - tight[:, :2],
+            centre_variance=np.full(len(masks), CENTRE_STD**2),
+            depth=depth,
             depth_variance=variance,
-            attributes=found.attributes,
-            attribute_variance=found.v,
-            intrinsics=K,
-            up=up,
-            image_size=(width, height),
+            depth_epistemic=epistemic,
         )
-        clock.lap("graph")
-        detections = Detections(graph, found.tight, found.masks)
-        return Seen(detections, found.scores, found.pixels, z, variance, epistemic, clock.laps)
 
-    def _detect(self, image: Tensor, generator: torch.Generator) -> _Objects:
+    def _detect(self, image: Tensor, generator: torch.Generator) -> tuple[Array, NDArray[np.bool_], Array, Array]:
+        """Confidence (n,), mask (n, H, W), class distribution (n, c) and its uncertainty (n,) of the objects."""
         detector, p = self.network.detector, self.params
         roi = detector.roi_heads
         scaled, _ = detector.transform([image])
@@ -256,13 +250,12 @@ class MaskRCNNPerception(LearnedPerception):
         keep = batched_nms(boxes, scores, torch.zeros_like(label), NMS_IOU)
         keep = keep[scores[keep] >= p.score][: p.candidates]
         masks = self._masks(features, boxes[keep], label[keep], scaled.image_sizes[0], image.shape[1:])
-        pixels = masks.sum((1, 2))
-        seen = pixels >= p.min_pixels
-        keep, masks = keep[seen], masks[seen].numpy()
+        seen = masks.sum((1, 2)) >= p.min_pixels
+        keep, masks = keep[seen], masks[seen]
         attributes, v = class_uncertainty(
             logits.view(T, len(proposals), -1)[:, keep][..., 1 + self._class_index], self.calibration.class_temperature
         )
-        return _Objects(scores[keep].double().numpy(), masks, pixels[seen].numpy(), tight_boxes(masks), attributes, v)
+        return scores[keep].double().numpy(), masks.numpy(), attributes, v
 
     def _masks(
         self, features: dict[str, Tensor], boxes: Tensor, label: Tensor, seen: tuple[int, int], size: Any
@@ -280,29 +273,16 @@ class MaskRCNNPerception(LearnedPerception):
         return (full > 0.5) & (owner == torch.arange(len(label))[:, None, None])
 
     def _object_depths(
-        self, image: Tensor, found: _Objects, focal: float, generator: torch.Generator
+        self, image: Tensor, at: Tensor, focal: float, generator: torch.Generator
     ) -> tuple[Array, Array, Array]:
-        """As `LearnedPerception` does it: mean over each mask, variance as mean over its pixels, epistemic part."""
-        n, T, D = len(found.scores), self.params.samples, self.params.depth_pixels
+        """As `LearnedPerception` does it, at pixels (n, D, 2): mean, variance as mean over pixels, epistemic part."""
+        (n, D), T = at.shape[:2], self.params.samples
         if n == 0:
             return np.zeros(0), np.zeros(0), np.zeros(0)
-        pixels = torch.from_numpy(spread_pixels(found.masks, found.pixels, found.tight, D)).reshape(-1, 2)
         maps = self.network.depth(2 * image[None] - 1)
-        seen = bilinear(maps, torch.zeros(n * D, dtype=torch.int64), pixels, STRIDE)
+        seen = bilinear(maps, torch.zeros(n * D, dtype=torch.int64), at.reshape(-1, 2), STRIDE)
         log_depth, log_variance = self.network.depth.read(seen, T > 1, generator, T)
-        return self._summarised(log_depth.view(T, n, D), log_variance.view(T, n, D), focal, found.scores, found.pixels)
-
-
-@dataclass(frozen=True, eq=False)
-class _Objects:
-    """n objects of one image, best first."""
-
-    scores: Array
-    masks: NDArray[np.bool_]
-    pixels: NDArray[np.int64]
-    tight: Array
-    attributes: Array
-    v: Array
+        return depth_uncertainty(log_depth.view(T, n, D), log_variance.view(T, n, D), focal)
 
 
 def _centroids(masks: NDArray[np.bool_]) -> Array:

@@ -142,7 +142,7 @@ class SimulatedPerception:
         n = len(positions)
         reported = along * np.exp(p.uncertainty_noise * rng.standard_normal(n))
         variance = (attributes * (1 - attributes)).mean(axis=1)
-        covariances = ray_covariances(positions, reported, across)
+        covariances = ray_covariances(positions, reported, np.stack([across, across], axis=1))
         covariances[:, :2, :2] += (hidden**2)[:, :, None] * np.eye(2)
         graph = ObjectGraph(
             positions=positions,

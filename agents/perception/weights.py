@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...matching.pose import Array
 
 TENSORS = "eyes.safetensors"
 MANIFEST = "eyes.json"
-FORMAT, VERSION = "covis-eyes", 3
+FORMAT, VERSION = "covis-eyes", 4
+SAME_TENSORS = (3, 4)
+"""Versions that differ in their calibration alone."""
 SHIPPED = Path(__file__).parent / "weights"
 """The folder of the weights that come with the package."""
 
@@ -26,11 +27,20 @@ class WeightsError(RuntimeError):
     """Weights that are missing, altered or of another format; the message names the file."""
 
 
-QUANTITIES = {"variance": 0.003, "epistemic": 0.2, "confidence": 1.0, "depth": 8.0, "pixels": 300.0}
-"""Of what the correction of a depth's variance is a function, each with a usual value, see `variance_features`."""
-VARIANCE_TERMS = (len(QUANTITIES) + 1) * (len(QUANTITIES) + 2) // 2
+QUANTITIES = {
+    "depth variance": 0.003,
+    "epistemic": 0.2,
+    "centre variance": 0.02,
+    "confidence": 1.0,
+    "depth": 8.0,
+    "width": 30.0,
+    "height": 30.0,
+}
+"""Of what the corrections are functions, each with a usual value, see `calibration_features`."""
+TERMS = (len(QUANTITIES) + 1) * (len(QUANTITIES) + 2) // 2
 FARTHEST = 3.0
 """Quantities are held within a factor e^3 of the usual: a square is no guide beyond what calibration has seen."""
+CORRECTIONS = ("depth", "along", "horizontal", "vertical")
 
 
 @dataclass(frozen=True)
@@ -38,49 +48,57 @@ class Calibration:
     """What makes depths unbiased and the reported uncertainty true, found on validation seeds.
 
     Attributes:
-        scale, exponent: a depth of z m is corrected to scale * z ** exponent.
-        depth: coefficients of the `variance_features` in the log of the factor on its variance.
-        centre: factor on the variance of the projected centre.
+        depth: coefficients of the `calibration_features` in the log of the factor on the depth.
+        along, horizontal, vertical: the same for the factors on the variance along the viewing ray, beyond the square
+            of that on the depth, and on the variances of the projected centre along the image's two axes.
         class_temperature: logits are divided by it.
     """
 
-    scale: float = 1.0
-    exponent: float = 1.0
-    depth: tuple[float, ...] = (0.0,) * VARIANCE_TERMS
-    centre: float = 1.0
+    depth: tuple[float, ...] = (0.0,) * TERMS
+    along: tuple[float, ...] = (0.0,) * TERMS
+    horizontal: tuple[float, ...] = (0.0,) * TERMS
+    vertical: tuple[float, ...] = (0.0,) * TERMS
     class_temperature: float = 1.0
 
     def __post_init__(self) -> None:
-        for name in ("scale", "exponent", "centre", "class_temperature"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise ValueError(f"Calibration.{name} must be positive, got {value}")
-        object.__setattr__(self, "depth", tuple(self.depth))
-        if len(self.depth) != VARIANCE_TERMS or not np.isfinite(self.depth).all():
-            raise ValueError(f"Calibration.depth must be {VARIANCE_TERMS} finite numbers, got {self.depth}")
+        if not (np.isfinite(self.class_temperature) and self.class_temperature > 0):
+            raise ValueError(f"Calibration.class_temperature must be positive, got {self.class_temperature}")
+        for name in CORRECTIONS:
+            value = tuple(getattr(self, name))
+            object.__setattr__(self, name, value)
+            if len(value) != TERMS or not np.isfinite(value).all():
+                raise ValueError(f"Calibration.{name} must be {TERMS} finite numbers, got {value}")
 
-    def variance_factor(self, features: Array) -> Array:
-        """Factor (n,) on variances with such features (n, VARIANCE_TERMS)."""
-        return np.exp(features @ np.array(self.depth))
+    def factors(self, features: Array) -> Array:
+        """Factors (n, 4) of the CORRECTIONS for objects with such features (n, TERMS)."""
+        return np.exp(features @ np.array([getattr(self, name) for name in CORRECTIONS]).T)
 
 
-def variance_features(
-    relative: Array, epistemic: Array, confidence: Array, depth: Array, pixels: NDArray[np.int64]
+def calibration_features(
+    *,
+    depth: Array,
+    depth_variance: Array,
+    depth_epistemic: Array,
+    centre_variance: Array,
+    confidence: Array,
+    size: Array,
 ) -> Array:
-    """What is known of how sure n depths are (n, VARIANCE_TERMS): 1, five logarithms, and all products of two of them.
+    """What is known of how sure n objects are (n, TERMS): 1, seven logarithms, and all products of two of them.
 
     Args:
-        relative: (n,) reported variance over the squared depth.
-        epistemic: (n,) share of the variance between samples in that.
+        depth: (n,) m, uncalibrated like all the others.
+        depth_variance, depth_epistemic: (n,) m^2, the whole and the part between samples.
+        centre_variance: (n,) of the projected centre per axis, in squares of the box's size along it.
         confidence: (n,) that this is an object.
-        depth: (n,) m.
-        pixels: (n,) visible.
+        size: (n, 2) px, width and height of the box.
     """
-    raw = (relative, np.maximum(epistemic, 0.02), np.maximum(confidence, 0.05), depth, pixels.astype(np.float64))
+    share = np.maximum(depth_epistemic / depth_variance, 0.02)
+    share = np.where(depth_epistemic == 0, QUANTITIES["epistemic"], share)  # a single sample: unknown
+    raw = (depth_variance / depth**2, share, centre_variance, np.maximum(confidence, 0.05), depth, *size.T)
     logs = [np.log(np.maximum(x, 1e-8) / usual) for x, usual in zip(raw, QUANTITIES.values(), strict=True)]
     x = np.clip(logs, -FARTHEST, FARTHEST)
     products = [x[i] * x[j] for i in range(len(x)) for j in range(i, len(x))]
-    return np.stack([np.ones(len(relative)), *x, *products], axis=1)
+    return np.stack([np.ones(len(depth)), *x, *products], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,8 +140,10 @@ def save(weights: Weights, folder: Path) -> None:
     _replace(folder / MANIFEST, (json.dumps(manifest, indent=1) + "\n").encode())
 
 
-def load(folder: Path | None = None) -> Weights:
+def load(folder: Path | None = None, *, calibrated: bool = True) -> Weights:
     """The weights in a folder; None = those that come with the package.
+
+    Without `calibrated` their calibration is not read, and may be one of an older version.
 
     Raises:
         WeightsError: a file is missing, the tensors are not those that the manifest vouches for, another format.
@@ -134,17 +154,16 @@ def load(folder: Path | None = None) -> Weights:
     for name in (MANIFEST, TENSORS):
         if not (folder / name).is_file():
             raise WeightsError(f"learned perception needs {folder / name}: train it with `covis train perception`")
-    manifest = read_manifest(folder)
+    manifest = read_manifest(folder, (VERSION,) if calibrated else SAME_TENSORS)
     content = (folder / TENSORS).read_bytes()
     found = hashlib.sha256(content).hexdigest()
     if found != manifest["sha256"]:
         raise WeightsError(f"{folder / TENSORS} has been altered: SHA-256 {found}, expected {manifest['sha256']}")
-    return Weights(
-        from_bytes(content), manifest["network"], Calibration(**manifest["calibration"]), manifest.get("notes", {})
-    )
+    calibration = Calibration(**manifest["calibration"]) if calibrated else Calibration()
+    return Weights(from_bytes(content), manifest["network"], calibration, manifest.get("notes", {}))
 
 
-def read_manifest(folder: Path) -> dict[str, Any]:
+def read_manifest(folder: Path, versions: tuple[int, ...] = (VERSION,)) -> dict[str, Any]:
     """The manifest of a folder.
 
     Raises:
@@ -156,8 +175,11 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise WeightsError(f"{path} cannot be read: {error}") from error
     stated = manifest.get("format"), manifest.get("version")
-    if stated != (FORMAT, VERSION):
-        raise WeightsError(f"{path} must be of format {FORMAT!r} version {VERSION}, got {stated}")
+    if stated not in [(FORMAT, version) for version in versions]:
+        hint = ""
+        if stated in [(FORMAT, version) for version in SAME_TENSORS]:
+            hint = f": calibrate them anew by `covis train perception --out {folder} --calibrate`"
+        raise WeightsError(f"{path} must be of format {FORMAT!r} version {VERSION}, got {stated}{hint}")
     missing = [key for key in ("sha256", "network", "calibration") if key not in manifest]
     if missing:
         raise WeightsError(f"{path} lacks {missing[0]!r}")

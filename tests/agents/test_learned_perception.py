@@ -20,6 +20,7 @@ from covis.agents.perception.decode import (  # noqa: E402
     spread_pixels,
     suppress,
 )
+from covis.agents.perception.detections import ray_covariances, ray_frames  # noqa: E402
 from covis.agents.perception.kinds import kind, open_eyes  # noqa: E402
 from covis.agents.perception.learned import LearnedPerception, LearnedPerceptionParams, build, camera_height  # noqa: E402
 from covis.agents.perception.network import (  # noqa: E402
@@ -298,14 +299,34 @@ def test_one_sample_is_without_dropout_and_deterministic():
     assert (a.depth_epistemic == 0).all()
 
 
-def test_calibration_scales_the_reported_variance():
-    four_times = (np.log(4.0), *[0.0] * (stored.VARIANCE_TERMS - 1))
-    plain, scaled = tiny_weights(), replace(tiny_weights(), calibration=stored.Calibration(depth=four_times))
+def test_calibration_scales_depths_and_the_variance_along_each_axis():
+    def always(factor: float) -> tuple[float, ...]:
+        return (np.log(factor), *[0.0] * (stored.TERMS - 1))
+
+    calibration = stored.Calibration(always(1.1), always(4.0), always(9.0), always(0.25))
+    plain, scaled = tiny_weights(), replace(tiny_weights(), calibration=calibration)
     params = LearnedPerceptionParams(samples=2, score=0.1, min_pixels=1)
     a, b = (
         LearnedPerception(CLASSES, w, params)(observation(), np.random.default_rng(0)).graph for w in (plain, scaled)
     )
-    np.testing.assert_allclose(b.position_variance, 4 * a.position_variance)
+    np.testing.assert_allclose(b.positions, 1.1 * a.positions)
+    np.testing.assert_allclose(b.position_variance, 1.21 * 4 * a.position_variance)
+    frames = ray_frames(a.positions)
+    before, after = (np.einsum("nki,nij,nlj->nkl", frames, graph.full_covariances(), frames) for graph in (a, b))
+    np.testing.assert_allclose(after, 1.21 * np.sqrt(np.outer([4, 9, 0.25], [4, 9, 0.25])) * before, atol=1e-9)
+
+
+def test_covariances_lie_along_the_ray_and_the_axes_of_the_image():
+    rng = np.random.default_rng(0)
+    positions = np.concatenate([rng.normal(size=(5, 3)) + [0, 0, 4], [[0, 0, 2]]])
+    frames = ray_frames(positions)
+    np.testing.assert_allclose(frames @ frames.transpose(0, 2, 1), np.broadcast_to(np.eye(3), frames.shape), atol=1e-12)
+    np.testing.assert_allclose(frames[-1], [[0, 0, 1], [1, 0, 0], [0, 1, 0]], atol=1e-12)
+    np.testing.assert_allclose(frames[:, 0], positions / np.linalg.norm(positions, axis=1)[:, None])
+    np.testing.assert_allclose(frames[:, 1, 1], 0, atol=1e-12)
+    C = ray_covariances(positions, np.full(6, 4.0), np.tile([9.0, 0.25], (6, 1)))
+    np.testing.assert_allclose(C[-1], np.diag([9, 0.25, 4]), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.eigvalsh(C), np.tile([0.25, 4, 9], (6, 1)))
 
 
 def test_folding_the_normalisation_changes_nothing():
@@ -361,7 +382,7 @@ def test_the_height_moves_the_depth_as_far_as_it_can_be_trusted():
 def test_weights_come_back_as_they_were_saved(tmp_path):
     saved = replace(
         tiny_weights(),
-        calibration=stored.Calibration(1.1, 0.98, tuple(0.1 * i for i in range(stored.VARIANCE_TERMS)), 3.0, 1.5),
+        calibration=stored.Calibration(*(tuple(k * i for i in range(stored.TERMS)) for k in (0.1, 0.2, 0.3, 0.4)), 1.5),
         notes={"minutes": 1},
     )
     stored.save(saved, tmp_path)
@@ -401,6 +422,16 @@ def test_another_format_is_refused(tmp_path):
     path.write_text("no json")
     with pytest.raises(stored.WeightsError, match="cannot be read"):
         stored.load(tmp_path)
+
+
+def test_weights_with_an_older_calibration_say_how_to_renew_it(tmp_path):
+    stored.save(tiny_weights(), tmp_path)
+    path = tmp_path / stored.MANIFEST
+    old = {"version": stored.SAME_TENSORS[0], "calibration": {"scale": 1.0}}
+    path.write_text(json.dumps(json.loads(path.read_text()) | old))
+    with pytest.raises(stored.WeightsError, match="--calibrate"):
+        stored.load(tmp_path)
+    assert stored.load(tmp_path, calibrated=False).calibration == stored.Calibration()
 
 
 def test_unknown_classes_are_named():

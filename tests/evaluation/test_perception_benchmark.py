@@ -2,13 +2,23 @@
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
-from covis.agents.perception.weights import Calibration, variance_features
-from covis.evaluation.perception_benchmark import ence, exact_spearman, perception_benchmark, row, shift, spearman
+from covis.agents.perception.weights import TERMS, Calibration, calibration_features
+from covis.evaluation.perception_benchmark import (
+    consistency,
+    ence,
+    exact_spearman,
+    perception_benchmark,
+    row,
+    shift,
+    spearman,
+)
 from covis.evaluation.perception_images import PerceptionTarget
 from covis.evaluation.perception_tally import MIN_PIXELS, CocoRecords, Tally, count, match_masks
 from covis.evaluation.perception_training import calibrate
 from covis.matching import ObjectGraph
+from covis.scripts.main import app
 
 
 def scene() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -58,33 +68,52 @@ def test_ap50_neither_wants_nor_forbids_small_objects():
     assert only_small.ap50() is None
 
 
-def gaussian_tally(scale: float, n: int = 4000, seed: int = 0) -> Tally:
-    """Errors whose variance is `scale` times what is reported."""
+def gaussian_tally(
+    scale: float | np.ndarray, n: int = 4000, seed: int = 0, across: tuple[float, float] = (4.0, 0.25)
+) -> Tally:
+    """Errors whose variance along the ray is `scale` times what is reported, and `across` times across it."""
     rng = np.random.default_rng(seed)
-    u = np.exp(rng.normal(0, 1, n))
-    across = np.exp(rng.normal(-3, 0.5, n))
-    lateral = np.linalg.norm(rng.normal(size=(n, 2)) * np.sqrt(4 * across)[:, None], axis=1)
+    distance = rng.uniform(5, 20, n)
+    u = distance**2 * np.exp(rng.normal(-6, 0.5, n))
+    lateral = np.exp(rng.normal(-3, 0.5, n))
     p = rng.dirichlet([1, 1, 1], n)
     true = np.array([rng.choice(3, p=q) for q in p])
-    distance = rng.uniform(5, 20, n)
-    error = np.sqrt(scale * u) * rng.standard_normal(n)
+    variances = np.stack([u, lateral, lateral], axis=1)
+    factors = np.stack([np.broadcast_to(scale, n), *(np.full(n, x) for x in across)], axis=1)
+    offset = np.sqrt(factors * variances) * rng.standard_normal((n, 3))
+    size = rng.uniform(10, 100, (n, 2))
+    features = known(u, distance, np.ones(n), size)
     return Tally(
         objects=n,
         detections=n,
         images=n,
-        error=[error],
+        counts=[np.ones(n, bool)],
+        error=[-offset[:, 0]],
         u=[u],
         v=[np.full(n, 0.1)],
-        across=[across],
-        lateral=[lateral],
+        offset=[offset],
+        variances=[variances],
         attributes=[p],
         true_class=[true],
         right_class=[p.argmax(1) == true],
         distance=[distance],
-        true_distance=[distance - error],
+        true_distance=[distance + offset[:, 0]],
         depth_ratio=[np.ones(n)],
-        size=[rng.uniform(60, 600, n)],
-        known=[variance_features(u / distance**2, np.full(n, 0.2), np.ones(n), distance, rng.uniform(60, 600, n))],
+        size=[size.prod(axis=1)],
+        features=[features],
+    )
+
+
+def known(u: np.ndarray, distance: np.ndarray, confidence: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Features of objects whose depths have the variances u (n,)."""
+    centre_variance = np.full(len(u), 0.02)
+    return calibration_features(
+        depth=distance,
+        depth_variance=u,
+        depth_epistemic=0.2 * u,
+        centre_variance=centre_variance,
+        confidence=confidence,
+        size=size,
     )
 
 
@@ -95,48 +124,63 @@ def test_ence_is_small_when_calibrated_and_known_when_not():
     assert ence(np.ones(3), np.ones(3)) is None
 
 
-def test_calibration_recovers_the_factors():
+def test_calibration_recovers_the_factors_of_every_axis():
     tallies = [gaussian_tally(4), gaussian_tally(4, seed=1)]
     found = calibrate(tallies)
     for tally in tallies:
-        np.testing.assert_allclose(found.variance_factor(tally.of("known")), 4, rtol=0.3)
-        assert np.median(found.variance_factor(tally.of("known"))) == pytest.approx(4, rel=0.1)
-    assert found.centre == pytest.approx(4, rel=0.15)
+        factors = found.factors(tally.of("features"))
+        np.testing.assert_allclose(np.median(factors, axis=0), [1, 4, 4, 0.25], rtol=0.1)
+        np.testing.assert_allclose(factors, np.broadcast_to([1, 4, 4, 0.25], factors.shape), rtol=0.5)
     assert found.class_temperature == pytest.approx(1, rel=0.1)
 
 
 def test_calibration_undoes_a_bias_of_scale():
     biased = gaussian_tally(1)
     biased.distance = [1.1 * d for d in biased.distance]
-    biased.depth_ratio = [1.1 * r for r in biased.depth_ratio]
-    biased.u = [1.21 * u for u in biased.u]
-    found = calibrate([biased])
-    assert found.scale == pytest.approx(1 / 1.1, rel=0.03)
-    assert found.exponent == pytest.approx(1, abs=0.01)
-    assert np.median(found.variance_factor(biased.of("known"))) == pytest.approx(1, rel=0.15)
+    biased.offset[0][:, 0] = biased.true_distance[0] - biased.distance[0]
+    biased.variances = [1.21 * v for v in biased.variances]
+    found = calibrate([biased]).factors(biased.of("features"))
+    np.testing.assert_allclose(found[:, 0], 1 / 1.1, rtol=0.03)
+    assert np.median(found[:, 1]) == pytest.approx(1, rel=0.15)
 
 
 def test_calibration_straightens_depths():
     bent = gaussian_tally(0.001)
     true = bent.true_distance[0]
-    bent.distance = [1.2 * true**0.9 + bent.error[0]]
-    bent.depth_ratio = [bent.distance[0] / true]
+    bent.distance = [1.2 * true**0.9]
+    bent.offset[0][:, 0] = true - bent.distance[0]
+    n = len(true)
+    bent.features = [known(bent.u[0], bent.distance[0], np.ones(n), np.full((n, 2), 30.0))]
     found = calibrate([bent])
-    np.testing.assert_allclose(found.scale * (1.2 * true**0.9) ** found.exponent, true, rtol=0.01)
+    np.testing.assert_allclose(found.factors(bent.features[0])[:, 0] * bent.distance[0], true, rtol=0.01)
 
 
 def test_calibration_learns_that_doubtful_objects_err_more_than_reported():
     n = 4000
-    biased = gaussian_tally(1, n)
     confidence = np.random.default_rng(3).uniform(0.1, 1, n)
-    biased.error = [biased.error[0] / confidence]
-    biased.true_distance = [biased.distance[0] - biased.error[0]]
-    relative = biased.u[0] / biased.distance[0] ** 2
-    biased.known = [variance_features(relative, np.full(n, 0.2), confidence, biased.distance[0], np.full(n, 300.0))]
-    factor = calibrate([biased]).variance_factor(biased.known[0])
+    biased = gaussian_tally(confidence**-2, n)
+    biased.features = [known(biased.u[0], biased.distance[0], confidence, np.full((n, 2), 30.0))]
+    factor = calibrate([biased]).factors(biased.features[0])[:, 1]
     assert np.corrcoef(np.log(factor), -np.log(confidence))[0, 1] > 0.95
     corrected, squared = factor * biased.u[0], biased.error[0] ** 2
     assert ence(corrected, squared) < 0.5 * ence(biased.u[0], squared)
+
+
+def test_calibration_uses_what_does_not_count_in_the_figures():
+    small = gaussian_tally(9)
+    small.counts = [np.zeros(4000, bool)]
+    assert len(small.of("u")) == 0
+    assert np.median(calibrate([small]).factors(small.of("features", every=True))[:, 1]) == pytest.approx(9, rel=0.1)
+
+
+def test_nees_by_axis():
+    found = consistency(gaussian_tally(1))
+    assert found["nees_along"] == pytest.approx(1, rel=0.1)
+    assert found["nees_horizontal"] == pytest.approx(4, rel=0.1)
+    assert found["nees_vertical"] == pytest.approx(0.25, rel=0.1)
+    assert found["nees"] == pytest.approx((1 + 4 + 0.25) / 3, rel=0.1)
+    assert 0.8 * found["nees"] < found["nees_without_1_percent"] < found["nees"]
+    assert consistency(Tally())["nees"] is None
 
 
 def test_calibration_without_detections_changes_nothing():
@@ -209,6 +253,7 @@ def test_counting_one_image():
         graph.positions[:, 2],
         np.ones(2),
         np.zeros(2),
+        np.zeros((2, TERMS)),
         {"all": 3.0},
     )
     out = Tally()
@@ -222,6 +267,36 @@ def test_counting_one_image():
     assert figures["ap50"] == pytest.approx(1)
     assert figures["recall"] == 1
     assert figures["precision"] == 1
+    np.testing.assert_allclose(out.of("offset")[0], [-1, 0, 0], atol=1e-12)
+    assert out.of("variances")[0, 0] == pytest.approx(1.0)
+
+
+def test_detections_that_meet_an_object_by_their_box_alone_count_for_calibration_only():
+    pytest.importorskip("torch")
+    pytest.importorskip("pycocotools")
+    from covis.agents.perception.detections import Detections
+    from covis.agents.perception.learned import Seen
+    from covis.evaluation.perception_images import Image
+
+    instances, masks, pixels = scene()
+    frame = masks[:1].copy()
+    frame[0, 7:23, 7:23] = False  # its box is the object's, its mask is not
+    graph = ObjectGraph.from_positions(np.array([[0.0, 0, 5]]), attributes=np.array([[0.9, 0.1]]))
+    seen = Seen(
+        Detections(graph, np.array([[5.0, 5, 25, 25]]), frame),
+        np.array([0.9]),
+        frame.sum(axis=(1, 2)),
+        np.array([5.0]),
+        np.ones(1),
+        np.zeros(1),
+        np.zeros((1, TERMS)),
+        {"all": 3.0},
+    )
+    out = Tally()
+    count(out, Image({}, instances, pixels, np.array([0, 1, 0]), np.array([[0.0, 0, 4]] * 3)), seen, 0.5)
+    assert (out.detections, out.true_detections) == (1, 0)
+    assert len(out.of("u")) == 0
+    assert out.of("error", every=True) == pytest.approx([1.0])
 
 
 def test_untrained_eyes_give_rows_for_a_known_and_a_held_out_target():
@@ -245,3 +320,39 @@ def test_untrained_eyes_give_rows_for_a_known_and_a_held_out_target():
         assert r["objects"] > 0
         assert {"ap50", "class_accuracy", "depth_abs_rel", "depth_spearman", "depth_only_spearman", "ence"} <= set(r)
     assert "u_ratio_matched" in rows[1]
+
+
+def test_weights_are_calibrated_anew_without_training(tmp_path, monkeypatch):
+    torch = pytest.importorskip("torch")
+    for package in ("safetensors", "pycocotools", "pybullet", "pettingzoo"):
+        pytest.importorskip(package)
+    from covis.agents.perception import weights as stored
+    from covis.agents.perception.frames import joint_classes
+    from covis.agents.perception.network import Eyes, NetworkParams
+
+    params = NetworkParams(joint_classes(), widths=(8, 8, 8, 8, 8), blocks=(0, 0, 0, 0), neck=16, head=16)
+    torch.manual_seed(0)
+    first = stored.Weights(
+        Eyes(params).state_dict(), params.to_dict(), Calibration(class_temperature=2.0), {"minutes": 3}
+    )
+    stored.save(first, tmp_path)
+    content = (tmp_path / stored.TENSORS).read_bytes()
+    asked = []
+
+    def tallies(weights, images, seed):
+        asked.append((weights.calibration, images))
+        return [(PerceptionTarget("target_localization"), gaussian_tally(4))]
+
+    monkeypatch.setattr("covis.evaluation.perception_training._tallies", tallies)
+    result = CliRunner().invoke(
+        app, ["train", "perception", "--out", str(tmp_path), "--calibrate", "--calibration-images", "5"]
+    )
+    assert result.exit_code == 0, result.output
+    assert asked == [(Calibration(), 5)]
+    renewed = stored.load(tmp_path)
+    assert renewed.calibration.along[0] == pytest.approx(np.log(4), abs=1)
+    assert renewed.notes == {"minutes": 3, "calibration_images_per_scene": 5}
+    assert (tmp_path / stored.TENSORS).read_bytes() == content
+    result = CliRunner().invoke(app, ["train", "perception", "--out", str(tmp_path / "none"), "--calibrate"])
+    assert result.exit_code == 2
+    assert "eyes.json" in result.output.replace("\n", "")
