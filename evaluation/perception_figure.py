@@ -52,15 +52,23 @@ def figure(image: Picture, found: Detections) -> Picture:
     return np.concatenate([_titled(p, title) for p, title in zip(panels, TITLES, strict=True)], axis=1)
 
 
+def require_drawable(file: Path) -> None:
+    """Raises ValueError for a kind of picture that cannot be written."""
+    if not (file.suffix and cv2.haveImageWriter(file.name)):
+        raise ValueError(f"a figure is written as .png or .jpg, not as {file.name!r}")
+
+
 def save_figure(file: Path, weights: Weights, seed: int = 0) -> None:
     """Write one row of panels per target of `covis benchmark perception`, in the format that the name asks for.
 
     Raises:
+        ValueError: see `require_drawable`.
         OSError: the file cannot be written.
     """
+    require_drawable(file)
     rows = [_liveliest(target, weights, seed) for target in default_targets()]
     file.parent.mkdir(parents=True, exist_ok=True)
-    _, code = cv2.imencode(file.suffix or ".png", cv2.cvtColor(np.concatenate(rows), cv2.COLOR_RGB2BGR))
+    _, code = cv2.imencode(file.suffix, cv2.cvtColor(np.concatenate(rows), cv2.COLOR_RGB2BGR))
     file.write_bytes(code.tobytes())
 
 

@@ -48,11 +48,13 @@ def benchmark(
     json_target: Annotated[str | None, typer.Option("--json", help="Write rows to FILE; - prints them.")] = None,
 ) -> None:
     """Score matchers by precision, recall, F1, calibration and displacement error."""
-    if "perception" in targets:
-        _perception(targets, seed or 0, perception or "learned", images, figure, json_target)
-        return
     given = {"pose": pose, "preset": preset, "min_common": min_common, "sequence": sequence or None, "seed": seed}
     changes = {"episodes": episodes, "perception": perception}
+    if "perception" in targets:
+        left = given | changes | {"method": method, "out": out_dir, "resume": resume or None}
+        unused = [name for name in _only(left) if name not in ("seed", "perception")]
+        _perception(targets, unused, seed or 0, perception or "learned", images, figure, json_target)
+        return
     verdicts: list[dict[str, Any]] = []
     how: dict[str, Any] = {"workers": workers, "engine": engine, "ray_address": ray_address}
     how |= {"out": out_dir, "resume": resume, "overwrite": overwrite}
@@ -117,22 +119,35 @@ def _interrupted(out_dir: Path | None) -> NoReturn:
 
 
 def _perception(
-    targets: list[str], seed: int, eyes: str, images: int | None, figure: Path | None, json_target: str | None
+    targets: list[str],
+    unused: list[str],
+    seed: int,
+    eyes: str,
+    images: int | None,
+    figure: Path | None,
+    json_target: str | None,
 ) -> None:
     """`covis benchmark perception`: learned eyes alone, on test scenes."""
     from ..evaluation.perception_benchmark import IMAGES, perception_benchmark, table_columns, weights_of
-    from ..evaluation.perception_figure import save_figure
 
     try:
         if targets != ["perception"]:
             raise ValueError(f"perception is benchmarked alone, got the targets {' '.join(targets)}")
+        if unused:
+            raise ValueError(f"perception has no {', '.join('--' + name.replace('_', '-') for name in unused)}")
         weights = weights_of(eyes)
         require_writable(json_target)
+        if figure is not None:
+            require("envs")
+            from ..evaluation.perception_figure import require_drawable, save_figure
+
+            require_drawable(figure)
+        number = IMAGES if images is None else images
         with progress_bar("perception") as progress:
-            rows = perception_benchmark(weights=weights, images=images or IMAGES, seed=seed, progress=progress)
+            rows = perception_benchmark(weights=weights, images=number, seed=seed, progress=progress)
         if figure is not None:
             save_figure(figure, weights, seed)
-    except (ValueError, RuntimeError) as error:
+    except (ValueError, RuntimeError, OSError) as error:
         fail(error)
     write_rows(rows, json_target)
     if json_target != "-":

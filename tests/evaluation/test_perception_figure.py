@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 pytest.importorskip("cv2")
 
 from covis.agents.perception.detections import Detections
 from covis.evaluation.perception_figure import BAND, figure
 from covis.matching import ObjectGraph
+from covis.scripts.main import app
 
 
 def found(masks: bool = True) -> Detections:
@@ -34,3 +36,23 @@ def test_no_detections_and_no_masks():
     assert figure(image, nothing).shape == (60 + BAND, 400, 3)
     with pytest.raises(ValueError, match="masks"):
         figure(image, found(masks=False))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--figure", "picture.txt"], "picture.txt"),
+        (["--json", "nowhere/rows.json"], "no folder"),
+        (["--images", "0"], "at least 1"),
+        (["--episodes", "3", "--method", "bayes"], "no --episodes, --method"),
+        (["--perception", "learned:nowhere"], "eyes.json"),
+        (["--perception", "simulated"], "only learned"),
+    ],
+)
+def test_the_benchmark_finds_out_at_its_beginning(options, message, tmp_path, monkeypatch):
+    for package in ("torch", "safetensors", "pycocotools", "pybullet", "pettingzoo"):
+        pytest.importorskip(package)
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(app, ["benchmark", "perception", *options])
+    assert result.exit_code == 2
+    assert message in result.output
