@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from .bayes_calibration import FEW, Calibration, calibrated, calibration_of, pair_features
+from .bayes_calibration import CALIBRATIONS, Evidence, calibrated, kind_of, pair_features
 from .bayes_overlap import overlap_features
 from .bayes_prepare import LOG_2PI, Problem, Settings, levelling_rotation, prepare, ranges
 from .bayes_solve import Modes, Prior, decode, mix, solve_levelled, solve_spatial
@@ -22,9 +22,6 @@ from .pose import Array, RelativePose
 HALF_RANGE_QUANTILE = 0.85
 OCCLUDER = 0.022
 OCCLUDED = 0.75
-POSE_CONCENTRATION = 1.0
-"""Nats by which poses of views that share objects are more concentrated than the uniform prior says (fitted)."""
-
 LEAST_HYPOTHESIS = 0.01
 ALTERNATIVES: tuple[tuple[float, float], ...] = ((0.2, 0.0), (4.0, 0.0), (1.0, 0.07))
 """Factor on all variances, and prior deviation of the robots' depth scales, tried where the reported ones fit badly."""
@@ -32,9 +29,6 @@ ALTERNATIVES: tuple[tuple[float, float], ...] = ((0.2, 0.0), (4.0, 0.0), (1.0, 0
 OTHER_SCALE_PROBABILITY = 0.02
 DOUBTFUL = -1.0
 """Log evidence below which wrong variances and scales are considered."""
-
-MIN_SCORE, MIN_SCORE_FEW = 0.42, 0.21
-"""Half the F1 to be expected where no calibration says otherwise; of views of at most FEW objects without a prior."""
 
 REPORTED_EXTENT = 0.54
 """Factor on `extent` for cameras that report full covariances: these know of part of it."""
@@ -113,7 +107,8 @@ def bayes(
     view_a, view_b = _views(source, target, L_a, L_b, detection)
 
     seen = view_a.known > 0 and view_b.known > 0
-    calibration = None if prior is not None else calibration_of(source, target, gravity, seen)
+    kind = kind_of(source, target, gravity, seen, prior is not None)
+    calibration = CALIBRATIONS[kind]
 
     def explain(scale: float, depth_scale_std: float) -> tuple[Problem, Modes]:
         problem = prepare(
@@ -135,20 +130,14 @@ def bayes(
     explanations = [(problem, found)]
     if rescale and found.log_evidence.max(initial=-math.inf) < DOUBTFUL:
         explanations += [_improbable(*explain(*x)) for x in ALTERNATIVES]
-    if calibration is not None:
-        pair = pair_features(problem)
-        explanations = [(x, _judged(x, y, pair, calibration)) for x, y in explanations]
-    modes = _joined([y for _, y in explanations]) if len(explanations) > 1 else explanations[0][1]
-    if calibration is None and prior is None:
-        modes = modes._replace(log_evidence=modes.log_evidence + POSE_CONCENTRATION)
+    evidence = Evidence(np.concatenate([_features(*x) for x in explanations]), pair_features(problem))
+    modes = _joined([y for _, y in explanations]) if len(explanations) > 1 else found
+    modes = modes._replace(log_evidence=calibrated(evidence, calibration))
     if prior is None:
         weights, P = mix(modes, math.log(common_probability), math.log1p(-common_probability), n, m)
     else:
         weights, P = mix(modes, 0.0, -1e9, n, m)
-    if min_score is None:
-        few = seen and prior is None and min(n, m) <= FEW
-        min_score = calibration.min_score if calibration else MIN_SCORE_FEW if few else MIN_SCORE
-    pairs, scores = decode(P, min_score)
+    pairs, scores = decode(P, calibration.min_score if min_score is None else min_score)
     hypotheses = _hypotheses(modes, weights, L_a, L_b, gravity, max_hypotheses)
     likeliest = hypotheses[0] if hypotheses else None
     refused = likeliest is None or likeliest.probability < weights[0]
@@ -162,6 +151,9 @@ def bayes(
             "modes": len(modes.log_evidence),
             "probabilities": P,
             "log_evidence": float(np.logaddexp.reduce(modes.log_evidence, initial=-math.inf)),
+            "calibration": kind,
+            "evidence": evidence,
+            "marginals": modes.marginals,
         },
     )
 
@@ -184,21 +176,18 @@ def _improbable(problem: Problem, modes: Modes) -> tuple[Problem, Modes]:
     return problem, modes._replace(log_evidence=modes.log_evidence + math.log(OTHER_SCALE_PROBABILITY))
 
 
-def _judged(x: Problem, modes: Modes, pair: Array, calibration: Calibration) -> Modes:
-    features = overlap_features(
+def _features(x: Problem, modes: Modes) -> Array:
+    return overlap_features(
         x.p_a, x.p_b, x.likely, x.median_range, modes.R, modes.t, modes.marginals, modes.log_evidence
     )
-    return modes._replace(log_evidence=calibrated(features, pair, calibration))
 
 
 def _joined(alternatives: list[Modes]) -> Modes:
-    """All modes as one list, best first, with the parameters that all of them have."""
+    """All modes as one list, with the parameters that all of them have."""
     size = min(x.information.shape[1] for x in alternatives)
     bias = min(x.bias.shape[1] for x in alternatives)
     trimmed = [x._replace(bias=x.bias[:, :bias], information=_marginal(x.information, size)) for x in alternatives]
-    arrays = [np.concatenate(x) for x in zip(*trimmed, strict=True)]
-    order = np.argsort(-arrays[3], kind="stable")
-    return Modes(*(np.ascontiguousarray(x[order]) for x in arrays))
+    return Modes(*(np.concatenate(x) for x in zip(*trimmed, strict=True)))
 
 
 def _marginal(information: Array, size: int) -> Array:

@@ -11,9 +11,17 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from .bayes_overlap import N_FEATURES
 from .bayes_prepare import Problem
 from .graph import ObjectGraph
 from .pose import Array
+
+
+class Evidence(NamedTuple):
+    """What is weighed of one pair of views: `overlap_features` of its modes (k, 8), and its `pair_features` (5,)."""
+
+    modes: Array
+    pair: Array
 
 
 class Calibration(NamedTuple):
@@ -31,32 +39,43 @@ class Calibration(NamedTuple):
     min_score: float
 
 
-UNSEEN = Calibration(
-    np.array([0.432, 0.142, -0.258, 0.125, 0.445, 1.526, 1.068, -1.824]),
-    np.array([0.0, 0.61, 0.02, 0.22, 0.0]),
-    np.array([2.9, 1.54, 0.29, -0.24, 0.0]),
-    0.42,
-)
-"""For graphs that know gravity and no field of view."""
-
-EYES = Calibration(
-    np.array([0.284, 0.448, 0.0, 0.0, 0.0, 0.0, 2.242, -1.617]),
-    np.array([0.0, -0.08, -0.99, 0.61, 0.05]),
-    np.array([-0.57, -0.08, 0.12, 1.52, -1.69]),
-    0.28,
-)
-"""For cameras that report full covariances: one network's errors in one image go together."""
-
-FIELDS = Calibration(
-    np.array([0.312, -0.022, 0.027, -0.072, 0.292, 5.916, 2.376, -1.962]),
-    np.array([0.0, 0.51, -0.22, 0.15, 0.0]),
-    np.array([4.88, 1.74, -1.04, 1.05, 0.0]),
-    0.42,
-)
-"""For known fields of view without images, and more than FEW objects: some of them hide."""
-
 FEW = 5
 """Objects of the smaller view up to which known fields of view without images count as they are."""
+
+_WHOLE, _NONE = np.eye(N_FEATURES)[0], np.zeros(5)
+_CONCENTRATED = np.array([1.0, 0.0, 0.0, 0.0, 0.0])
+"""A nat: poses of views that share objects are more concentrated than the uniform prior says (fitted)."""
+
+CALIBRATIONS = {
+    # Gravity known, and no field of view.
+    "unseen": Calibration(
+        np.array([0.432, 0.142, -0.258, 0.125, 0.445, 1.526, 1.068, -1.824]),
+        np.array([0.0, 0.61, 0.02, 0.22, 0.0]),
+        np.array([2.9, 1.54, 0.29, -0.24, 0.0]),
+        0.42,
+    ),
+    # Cameras that report full covariances: one network's errors in one image go together.
+    "eyes": Calibration(
+        np.array([0.284, 0.448, 0.0, 0.0, 0.0, 0.0, 2.242, -1.617]),
+        np.array([0.0, -0.08, -0.99, 0.61, 0.05]),
+        np.array([-0.57, -0.08, 0.12, 1.52, -1.69]),
+        0.28,
+    ),
+    # Known fields of view without images, and more than FEW objects: some of them hide.
+    "fields": Calibration(
+        np.array([0.312, -0.022, 0.027, -0.072, 0.292, 5.916, 2.376, -1.962]),
+        np.array([0.0, 0.51, -0.22, 0.15, 0.0]),
+        np.array([4.88, 1.74, -1.04, 1.05, 0.0]),
+        0.42,
+    ),
+    # Known fields of view without such cameras, and at most FEW objects.
+    "few": Calibration(_WHOLE, _NONE, _CONCENTRATED, 0.21),
+    # Cameras without covariances, or gravity unknown.
+    "whole": Calibration(_WHOLE, _NONE, _CONCENTRATED, 0.42),
+    # With a prior pose.
+    "posed": Calibration(_WHOLE, _NONE, _NONE, 0.42),
+}
+"""By `kind_of` graphs. The first three are the work of `covis train calibration`; the others count evidence whole."""
 
 
 @njit(cache=True)
@@ -89,18 +108,22 @@ def pair_features(x: Problem) -> Array:
     return np.array([1.0, place, min(nats / total - 0.5, 1.0), high, few])
 
 
-def calibration_of(source: ObjectGraph, target: ObjectGraph, gravity: bool, seen: bool) -> Calibration | None:
-    """The calibration for such graphs; None: their evidence counts whole."""
+def kind_of(source: ObjectGraph, target: ObjectGraph, gravity: bool, seen: bool, posed: bool) -> str:
+    """The entry of CALIBRATIONS for such graphs: is gravity known, are both fields of view, is a prior pose given."""
+    if posed:
+        return "posed"
+    if gravity and not seen:
+        return "unseen"
     graphs = (source, target)
-    if not gravity:
-        return None
-    if not seen:
-        return UNSEEN
-    if all(g.intrinsics is not None and g.covariances is not None for g in graphs):
-        return EYES
-    return FIELDS if all(g.intrinsics is None and len(g) > FEW for g in graphs) else None
+    if gravity and all(g.intrinsics is not None and g.covariances is not None for g in graphs):
+        return "eyes"
+    if seen and min(len(source), len(target)) <= FEW:
+        return "few"
+    return "fields" if gravity and all(g.intrinsics is None for g in graphs) else "whole"
 
 
-def calibrated(features: Array, pair: Array, calibration: Calibration) -> Array:
-    """Calibrated log evidence (k,) of modes with `features` (k, 8), of a pair of views with features `pair` (5,)."""
-    return np.exp(pair @ calibration.damping) * (features @ calibration.terms) + pair @ calibration.offset
+def calibrated(evidence: Evidence, calibration: Calibration) -> Array:
+    """Calibrated log evidence (k,) of the modes."""
+    pair = evidence.pair
+    damping = np.exp(pair @ calibration.damping)
+    return damping * (evidence.modes @ calibration.terms) + pair @ calibration.offset

@@ -1,4 +1,4 @@
-"""`covis train`: perception from rendered frames, policies from episodes."""
+"""`covis train`: perception from rendered frames, policies from episodes, the matcher's calibration from pairs."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import typer
 from rich.table import Table
 
 from ..evaluation.extras import require
-from .console import err, fail, progress_bar
+from .console import err, fail, progress_bar, require_writable
 from .console import out as console
 
-app = typer.Typer(help="Train what learns: perception, policies.", no_args_is_help=True)
+app = typer.Typer(help="Train what learns: perception, policies, calibration.", no_args_is_help=True)
 
 
 @app.callback()
@@ -113,6 +113,80 @@ def policy(
             table.add_row(*("" if row[key] is None else form.format(row[key]) for key, _, form in COLUMNS))
         console.print(table)
     err.print(f"{file}: trained", soft_wrap=True)
+
+
+@app.command()
+def calibration(
+    kind: Annotated[str, typer.Argument(help="Which weights: unseen | eyes | fields.")],
+    targets: Annotated[
+        list[str], typer.Argument(help="Dataset folders, or generated problems such as cad-hard.", metavar="TARGET...")
+    ],
+    weight: Annotated[
+        list[str] | None, typer.Option(help="TARGET=W: its pairs count W times; repeatable. Default 1.")
+    ] = None,
+    frames: Annotated[
+        int | None, typer.Option(help="At most so many of each, evenly spread; of generated ones so many, else 100.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of shuffling, generated pairs and halves.")] = 0,
+    json_target: Annotated[str | None, typer.Option("--json", help="Write weights and rows to FILE.")] = None,
+) -> None:
+    """Fit how far `bayes` trusts its evidence to pairs of views, and measure it on halves of them.
+
+    Poses are unknown to the matcher. Prints the weights as `covis.matching.bayes_calibration` holds them, and F1 and
+    ECE with evidence that counts whole, the package's weights, the fitted ones, and half by half.
+    """
+    from ..evaluation.calibration_fit import collect, fittable, refit
+
+    try:
+        if kind not in fittable():
+            raise ValueError(f"no weights are kept for {kind!r}; there are {', '.join(fittable())}")
+        require_writable(json_target)
+        weights = _weights(weight or [])
+        pairs = []
+        for target in targets:
+            with progress_bar(f"evidence of {Path(target).name}") as progress:
+                pairs += collect(target, frames=frames, seed=seed, progress=progress)
+        found = refit(kind, pairs, weights, seed)
+    except (ValueError, RuntimeError, OSError) as error:
+        fail(error)
+    fitted = {
+        name: value if isinstance(value, float) else value.round(3).tolist()
+        for name, value in found.fitted._asdict().items()
+    }
+    if json_target is not None:
+        content = {"kind": kind, **fitted, "weights": weights, "seed": seed, "rows": found.rows}
+        Path(json_target).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    console.print(_comparison(found.rows))
+    for name, value in fitted.items():
+        console.print(f"{name}: {value}", highlight=False)
+    if found.left_out:
+        err.print(f"{found.left_out} pairs are of another kind and were left out")
+
+
+def _weights(texts: list[str]) -> dict[str, float]:
+    weights = {}
+    for text in texts:
+        name, _, value = text.rpartition("=")
+        try:
+            weights[name] = float(value)
+        except ValueError:
+            raise ValueError(f"a weight is TARGET=W, got {text!r}") from None
+        if not (name and weights[name] > 0):
+            raise ValueError(f"a weight is TARGET=W with W above 0, got {text!r}")
+    return weights
+
+
+def _comparison(rows: list[dict[str, Any]]) -> Table:
+    """F1 and ECE of every set under each calibration."""
+    table = Table(header_style="bold")
+    names = [name for name in ("whole", "held", "fitted", "halves") if f"{name}_f1" in rows[0]]
+    for title in ("target", "pairs", "emitted", *(f"F1 {n}" for n in names), *(f"ECE {n}" for n in names)):
+        table.add_column(title, justify="left" if title == "target" else "right")
+    for row in rows:
+        figures = [row[f"{name}_{key}"] for key in ("f1", "ece") for name in names]
+        shown = ("" if value is None else f"{value:.3f}" for value in figures)
+        table.add_row(row["target"], str(row["pairs"]), str(row["fitted_emitted"]), *shown)
+    return table
 
 
 def _print_iteration(row: dict[str, float]) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from covis.matching import ObjectGraph, RelativePose, bayes
 from covis.matching.bayes_assignment import assignment_marginals
-from covis.matching.bayes_calibration import EYES, FEW, FIELDS, UNSEEN, calibrated, calibration_of, pair_features
+from covis.matching.bayes_calibration import CALIBRATIONS, FEW, Evidence, calibrated, kind_of, pair_features
 from covis.matching.bayes_overlap import MARGIN_RAD, REACH, overlap_features
 from covis.matching.bayes_prepare import Settings, class_evidence, height_correction, levelling_rotation, prepare
 from covis.matching.metrics import count, expected_calibration_error, is_correct, pooled
@@ -453,35 +453,40 @@ def test_calibrated_evidence_keeps_the_order_of_equal_modes_and_falls_where_matc
     rng = np.random.default_rng(13)
     features = rng.standard_normal((20, 8))
     features[:, 1:] = features[0, 1:]
-    for calibration in (UNSEEN, EYES, FIELDS):
-        telling, vague = np.array([1.0, 1.0, 0.0, 0.0, 0.0]), np.array([1.0, -1.0, 0.0, 0.0, 0.0])
-        strong = calibrated(features, telling, calibration)
-        np.testing.assert_array_equal(np.argsort(strong), np.argsort(features[:, 0]))
-    assert np.ptp(calibrated(features, vague, UNSEEN)) < 0.5 * np.ptp(calibrated(features, telling, UNSEEN))
+    telling, vague = (Evidence(features, np.array([1.0, place, 0.0, 0.0, 0.0])) for place in (1.0, -1.0))
+    for calibration in CALIBRATIONS.values():
+        np.testing.assert_array_equal(np.argsort(calibrated(telling, calibration)), np.argsort(features[:, 0]))
+    unseen = CALIBRATIONS["unseen"]
+    assert np.ptp(calibrated(vague, unseen)) < 0.5 * np.ptp(calibrated(telling, unseen))
 
 
 def test_which_calibration():
     (a, _), (b, _) = crowd(np.random.default_rng(15), n=60)
     assert min(len(a), len(b)) > FEW
-    assert calibration_of(a, b, True, True) is EYES
-    assert calibration_of(a, b, False, True) is None
+    assert kind_of(a, b, gravity=True, seen=True, posed=False) == "eyes"
+    assert kind_of(a, b, gravity=True, seen=True, posed=True) == "posed"
+    assert kind_of(a, b, gravity=False, seen=True, posed=False) == "whole"
     plain, other = (replace(g, intrinsics=None, image_size=None) for g in (a, b))
-    assert calibration_of(plain, other, True, False) is UNSEEN
-    assert calibration_of(plain, other, True, True) is FIELDS
-    assert calibration_of(plain, other.take(np.arange(4)), True, True) is None
+    assert kind_of(plain, other, gravity=True, seen=False, posed=False) == "unseen"
+    assert kind_of(plain, other, gravity=True, seen=True, posed=False) == "fields"
+    assert kind_of(plain, other.take(np.arange(4)), gravity=True, seen=True, posed=False) == "few"
     # Images without covariances: the detector says nothing of its own errors.
-    assert calibration_of(replace(a, covariances=None), b, True, True) is None
+    assert kind_of(replace(a, covariances=None), b, gravity=True, seen=True, posed=False) == "whole"
 
 
 def test_default_threshold():
     rng = np.random.default_rng(14)
-    (a, _), (b, _) = crowd(rng)
-    np.testing.assert_array_equal(bayes(a, b).pairs, bayes(a, b, min_score=EYES.min_score).pairs)
-    (a, _, _), (b, _, _) = scene(rng, common=4, alone=7, noise=0.05)
-    np.testing.assert_array_equal(bayes(a, b).pairs, bayes(a, b, min_score=UNSEEN.min_score).pairs)
-    least = []
-    for _ in range(30):
-        views = scene(rng, common=3, alone=2, noise=0.05)
-        known = [replace(g, forward=np.array([1.0, 0.0, 0.0]), horizontal_fov_rad=1.5) for g, _, _ in views]
-        least.append(bayes(*known).scores.min(initial=1.0))
-    assert 0.21 <= min(least) < 0.42
+    (camera, _), (other, _) = crowd(rng)
+    (a, _, T_a), (b, _, T_b) = scene(rng, common=4, alone=7, noise=0.05)
+    prior = RelativePose(invert(T_a) @ T_b, 0.01 * np.eye(6))
+    seen = [replace(g, forward=np.array([1.0, 0.0, 0.0]), horizontal_fov_rad=1.5) for g in (a, b)]
+    few = [g.take(np.arange(5)) for g in seen]
+    bare = [replace(g, up=None) for g in (a, b)]
+    problems = {"eyes": (camera, other), "unseen": (a, b), "fields": seen, "few": few, "whole": bare, "posed": (a, b)}
+    assert problems.keys() == CALIBRATIONS.keys()
+    for kind, (one, two) in problems.items():
+        known = prior if kind == "posed" else None
+        least = CALIBRATIONS[kind].min_score
+        default = bayes(one, two, prior=known)
+        assert default.diagnostics["calibration"] == kind
+        np.testing.assert_array_equal(default.pairs, bayes(one, two, prior=known, min_score=least).pairs)
