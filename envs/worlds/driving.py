@@ -92,7 +92,7 @@ class ConnectedDrivingWorld:
         for _ in range(MAX_TRIES):
             episode = self._generate(rng)
             if episode is not None:
-                self._episode = episode
+                self._replace(episode)
                 return
         raise SceneGenerationError(
             f"no room for {self.n_robots} connected vehicles on map {self.params.map!r} "
@@ -167,7 +167,7 @@ class ConnectedDrivingWorld:
 
     def close(self) -> None:
         """Forget the episode."""
-        self._episode = None
+        self._replace(None)
 
     # --- beyond the protocol -----------------------------------------------------------------------------------------
 
@@ -192,7 +192,9 @@ class ConnectedDrivingWorld:
 
     def save_state(self) -> Any:
         """An opaque copy of the whole state; `restore_state` continues from it bit-identically."""
-        return self._copied(self._running())
+        saved = self._copied(self._running())
+        saved.road.unbind()
+        return saved
 
     def restore_state(self, state: Any) -> None:
         """Go back to a state of `save_state`, any number of times.
@@ -202,7 +204,9 @@ class ConnectedDrivingWorld:
         """
         if not isinstance(state, _Episode):
             raise ValueError(f"state must come from save_state, got {type(state).__name__}")
-        self._episode = self._copied(state)
+        episode = self._copied(state)
+        episode.road.bind()
+        self._replace(episode)
 
     # --- a step ------------------------------------------------------------------------------------------------------
 
@@ -210,6 +214,11 @@ class ConnectedDrivingWorld:
         if self._episode is None:
             raise RuntimeError("the world has no scene: call reset(rng) first")
         return self._episode
+
+    def _replace(self, episode: _Episode | None) -> None:
+        if self._episode is not None:
+            self._episode.road.unbind()
+        self._episode = episode
 
     def _copied(self, episode: _Episode) -> _Episode:
         table = self._network.table
@@ -279,6 +288,7 @@ class ConnectedDrivingWorld:
         self._remove_leaving(episode)
         road.vehicles = [v for v in road.vehicles if not v.crashed]
         if not self._place_connected(episode):
+            road.unbind()
             return None
         episode.street_identity = episode.next_identity + np.arange(len(street.objects))
         episode.next_identity += len(street.objects)

@@ -224,6 +224,19 @@ class FastRoad(RegulatedRoad):
         super().__init__(network=network, np_random=rng, neighbour_vehicles_connected_lanes=network.connected_lanes)
         self.regulated = regulated
 
+    def bind(self) -> None:
+        """Tell every vehicle and obstacle that this is its road; they cannot move without one."""
+        for body in (*self.vehicles, *self.objects):
+            body.road = self
+
+    def unbind(self) -> None:
+        """Undo `bind`: a road that nobody holds is then freed at once, and not when Python looks for cycles.
+
+        Python seldom does in a big process. Roads of a thousand episodes would be waiting by then.
+        """
+        for body in (*self.vehicles, *self.objects):
+            body.road = None
+
     def act(self) -> None:
         """Decide all actions: highway-env's `Road.act`."""
         if not self.vehicles:

@@ -384,6 +384,35 @@ def test_resets_leak_nothing(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
+def test_past_episodes_do_not_wait_for_the_garbage_collector(name):
+    env = make(name)
+    env.reset(seed=0)
+    gc.collect()
+    enabled = gc.isenabled()
+    gc.disable()
+    gc.set_debug(gc.DEBUG_SAVEALL)
+    try:
+        for seed in range(3):
+            env.reset(seed=seed)
+            env.step(idle(env))
+            if hasattr(env.world, "save_state"):
+                saved = env.save_state()
+                env.step(idle(env))
+                env.restore_state(saved)
+                env.step(idle(env))
+                del saved
+        env.close()
+        gc.collect()
+        waiting = {f"{type(o).__module__}.{type(o).__qualname__}" for o in gc.garbage}
+    finally:
+        gc.set_debug(0)
+        gc.garbage.clear()
+        if enabled:
+            gc.enable()
+    assert not [name for name in waiting if name.startswith(("covis.", "highway_env.", "numpy."))]
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_an_episode_must_be_begun_and_ends(name):
     env = make(name, max_cycles=1)
     for call in (env.state, env.ground_truth, env.snapshot, env.camera_frames, lambda: env.step({})):
