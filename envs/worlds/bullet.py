@@ -20,7 +20,7 @@ from types import ModuleType
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from .world import Array
 
@@ -229,7 +229,7 @@ class BoxDynamics(Engine):
         speed, rate = commands[:, 0].tolist(), commands[:, 1].tolist()
         angular = [(0.0, 0.0, r) for r in rate]
         heading = state.planar[:, 2].tolist()
-        touched = np.zeros(n, dtype=bool)
+        touching: set[int] = set()
         for _ in range(self._updates):
             for body in range(n):
                 chord = heading[body] + 0.5 * interval * rate[body]
@@ -237,17 +237,18 @@ class BoxDynamics(Engine):
             p.stepSimulation(client)
             heading = [h + interval * r for h, r in zip(heading, rate, strict=True)]
             contacts = p.getContactPoints(physicsClientId=client)
+            turned: set[int] = set()
             for contact in contacts:
-                for body in contact[1:3]:
-                    if body < n:  # a contact may have turned it
-                        heading[body] = _heading(get_pose(body, client)[1])
-                        touched[body] |= contact[8] <= CONTACT_M
+                bodies = contact[1:3]
+                turned.update(bodies)
+                if contact[8] <= CONTACT_M:
+                    touching.update(bodies)
+            for body in turned:
+                if body < n:  # a contact may have turned it
+                    heading[body] = _heading(get_pose(body, client)[1])
         self._cache_empty = not contacts
-        planar = np.empty((n, 3))
-        for body in range(n):
-            position, turn = get_pose(body, client)
-            planar[body] = position[0], position[1], _heading(turn)
-        planar = wrapped(planar)
+        touched = np.array([body in touching for body in range(n)], dtype=bool)
+        planar = wrapped([_planar(*get_pose(body, client)) for body in range(n)])
         moved = wrapped(planar - state.planar) / self._step_seconds
         return frozen_state(planar, moved, state.inner), touched
 
@@ -279,11 +280,16 @@ def frozen_state(planar: Array, velocity: Array, inner: Array) -> BodyState:
     return BodyState(planar, velocity, inner)
 
 
-def wrapped(planar: Array) -> Array:
+def wrapped(planar: ArrayLike) -> Array:
     """A copy of (n, 3), its third column brought into [-pi, pi] rad; what is inside stays the same bit for bit."""
-    out = np.array(planar, dtype=np.float64)
+    out = np.array(planar, dtype=np.float64).reshape(-1, 3)
     out[:, 2] -= 2 * np.pi * np.round(out[:, 2] / (2 * np.pi))
     return out
+
+
+def _planar(position: Sequence[float], turn: Sequence[float]) -> tuple[float, float, float]:
+    """x m, y m, heading rad of a position and a quaternion."""
+    return position[0], position[1], _heading(turn)
 
 
 def _heading(turn: Sequence[float]) -> float:
