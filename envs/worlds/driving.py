@@ -123,39 +123,35 @@ class ConnectedDrivingWorld:
         """The present instant."""
         episode = self._running()
         n, street = self.n_robots, episode.street
+        objects, scenery = street.objects, street.scenery
         vehicles = [*episode.connected, *(v for v in episode.road.vehicles if not isinstance(v, ConnectedVehicle))]
-        positions = np.vstack([to_world(np.array([v.position for v in vehicles])), street.objects.places()])
-        headings = np.array([-v.heading for v in vehicles] + street.objects.headings)
-        sizes = np.array([KINDS[v.kind].size for v in vehicles] + street.objects.sizes)
-        heights = np.array([KINDS[v.kind].size[2] / 2 for v in vehicles] + street.objects.heights)
-        m = len(positions)
+        kinds = [KINDS[v.kind] for v in vehicles]
+        positions = np.vstack([to_world(np.array([v.position for v in vehicles])), objects.positions])
+        headings = np.concatenate([[-v.heading for v in vehicles], objects.headings])
+        heights = np.concatenate([[kind.size[2] / 2 for kind in kinds], objects.heights])
+        m, moving = len(positions), len(vehicles)
         velocities = np.zeros((m, 3))
         speeds = np.array([v.speed for v in vehicles])
-        velocities[: len(vehicles), 0] = speeds * np.cos(headings[: len(vehicles)])
-        velocities[: len(vehicles), 1] = speeds * np.sin(headings[: len(vehicles)])
-        velocities[len(vehicles) :, :2] = street.velocities()
-        looks = [episode.looks[v.identity] for v in vehicles]
-        scenery = street.scenery
+        velocities[:moving, 0] = speeds * np.cos(headings[:moving])
+        velocities[:moving, 1] = speeds * np.sin(headings[:moving])
+        velocities[moving:, :2] = street.velocities()
+        meshes, tints = zip(*(episode.looks[v.identity] for v in vehicles), strict=True)
         poses = planar_poses(
-            np.vstack([positions, scenery.places(), to_world(self.map.obstacles), np.zeros((1, 2))]),
+            np.vstack([positions, scenery.positions, to_world(self.map.obstacles), np.zeros((1, 2))]),
             np.concatenate([headings, scenery.headings, np.zeros(len(self.map.obstacles) + 1)]),
         )
         fixed = [self._surface - 1] * len(self.map.obstacles) + [self._surface]
         return Snapshot(
             time=episode.time,
             identity=np.concatenate([[v.identity for v in vehicles], episode.street_identity]).astype(np.int64),
-            object_class=np.array([KINDS[v.kind].object_class for v in vehicles] + street.objects.classes, np.int64),
+            object_class=np.concatenate([[kind.object_class for kind in kinds], objects.classes]),
             positions=np.column_stack([positions, heights]),
             velocities=velocities,
             headings=headings,
-            sizes=sizes,
-            body_mesh=np.array(
-                [mesh for mesh, _ in looks] + street.objects.meshes + scenery.meshes + fixed, dtype=np.int64
-            ),
+            sizes=np.vstack([[kind.size for kind in kinds], objects.sizes]),
+            body_mesh=np.concatenate([meshes, objects.meshes, scenery.meshes, fixed]).astype(np.int64),
             body_poses=poses,
-            body_tints=np.array(
-                [tint for _, tint in looks] + street.objects.tints + scenery.tints + [WHITE] * len(fixed)
-            ),
+            body_tints=np.vstack([tints, objects.tints, scenery.tints, [WHITE] * len(fixed)]),
             body_object=np.concatenate([np.arange(m), np.full(len(poses) - m, -1)]).astype(np.int64),
             T_world_camera=poses[:n] @ self._T_body_camera(),
             robot_object=np.arange(n, dtype=np.int64),
@@ -242,7 +238,7 @@ class ConnectedDrivingWorld:
         vehicles = episode.road.vehicles
         arms = {lane: arm for arm, (lane, _) in enumerate(self.map.entries)}
         held_back = {arms[v.lane_index] for v in vehicles if getattr(v, "is_yielding", False) and v.lane_index in arms}
-        moving = np.array([(*v.position, v.heading, v.speed) for v in vehicles])
+        moving = np.array([(*v.position.tolist(), v.heading, v.speed) for v in vehicles])
         moving[:, 1:3] *= -1
         episode.street.step(self.step_seconds, episode.time, lambda point: _safe_to_cross(point, moving), held_back)
         crossers = {}
@@ -424,7 +420,7 @@ def _cars(vehicles: list[ConnectedVehicle]) -> Array:
 
 
 def _pedestrians(street: Street) -> Array:
-    return street.objects.footprints(len(street.objects) - len(street.walkers))
+    return street.objects.footprints()[len(street.objects) - len(street.walkers) :]
 
 
 def _pedestrian_obstacle(road: FastRoad, position: Array) -> Obstacle:

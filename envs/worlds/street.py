@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .driving_params import (
     KINDS,
@@ -64,39 +66,48 @@ class Catalogue:
     footprints: tuple[tuple[float, float], ...]
 
 
+class Thing(NamedTuple):
+    """Something with a mesh: where it stands, its class (-1: scenery), size, look, and its middle's height (m)."""
+
+    site: Site
+    kind: int
+    size: Size
+    mesh: int
+    tint: Tint
+    height: float
+
+
 @dataclass
 class Things:
     """n things: positions (n, 2) m, headings rad, classes, sizes (n, 3) m, meshes, tints, middle heights (n,) m."""
 
-    positions: list[tuple[float, float]] = field(default_factory=list)
-    headings: list[float] = field(default_factory=list)
-    classes: list[int] = field(default_factory=list)
-    sizes: list[Size] = field(default_factory=list)
-    meshes: list[int] = field(default_factory=list)
-    tints: list[Tint] = field(default_factory=list)
-    heights: list[float] = field(default_factory=list)
+    positions: Array
+    headings: Array
+    classes: NDArray[np.int64]
+    sizes: Array
+    meshes: NDArray[np.int64]
+    tints: Array
+    heights: Array
 
-    def add(self, site: Site, kind: int, size: Size, mesh: int, tint: Tint, height: float | None = None) -> None:
-        """Append one; without a `height` it stands on the ground."""
-        self.positions.append(site[0])
-        self.headings.append(site[1])
-        self.classes.append(kind)
-        self.sizes.append(size)
-        self.meshes.append(mesh)
-        self.tints.append(tint)
-        self.heights.append(size[2] / 2 if height is None else height)
+    @classmethod
+    def of(cls, things: list[Thing]) -> Things:
+        """One row per thing."""
+        return cls(
+            positions=np.array([t.site[0] for t in things], dtype=np.float64).reshape(-1, 2),
+            headings=np.array([t.site[1] for t in things], dtype=np.float64),
+            classes=np.array([t.kind for t in things], dtype=np.int64),
+            sizes=np.array([t.size for t in things], dtype=np.float64).reshape(-1, 3),
+            meshes=np.array([t.mesh for t in things], dtype=np.int64),
+            tints=np.array([t.tint for t in things], dtype=np.float64).reshape(-1, 3),
+            heights=np.array([t.height for t in things], dtype=np.float64),
+        )
 
     def __len__(self) -> int:
         return len(self.positions)
 
-    def places(self) -> Array:
-        """(n, 2) m."""
-        return np.array(self.positions, dtype=np.float64).reshape(-1, 2)
-
-    def footprints(self, first: int = 0) -> Array:
-        """(n, 5) x, y, heading, length, width, from the thing of that index on."""
-        sizes = np.array(self.sizes[first:], dtype=np.float64).reshape(-1, 3)
-        return np.column_stack([self.places()[first:], self.headings[first:], sizes[:, :2]])
+    def footprints(self) -> Array:
+        """(n, 5) x, y, heading, length, width."""
+        return np.column_stack([self.positions, self.headings, self.sizes[:, :2]])
 
 
 @dataclass
@@ -151,7 +162,7 @@ class Walker:
     def site(self) -> Site:
         """Where it stands."""
         k = min(int(self.at), len(self.path) - 2)
-        (ax, ay), (bx, by) = self.path[k].tolist(), self.path[k + 1].tolist()
+        (ax, ay), (bx, by) = self.path[k : k + 2].tolist()
         dx, dy = bx - ax, by - ay
         length, t = math.hypot(dx, dy), self.at - k
         x = ax + t * dx - self.lateral * dy / length
@@ -181,21 +192,20 @@ class Street:
     """
 
     def __init__(self, rng: np.random.Generator, params: DrivingParams, ground: Ground, catalogue: Catalogue) -> None:
-        self.objects, self.scenery = Things(), Things()
         self.signals: list[Signal] = []
         self.walkers: list[Walker] = []
         self._rng, self._params, self._ground, self._catalogue = rng, params, ground, catalogue
         self._taken: list[tuple[float, float, float]] = []
         signals = self._find_signals()
-        self._add_parked()
-        self._add_signs()
-        for site in signals:
-            self.objects.add(site, SIGNAL, SIGNAL_SIZE, catalogue.signals[GREEN], WHITE, SIGNAL_HEIGHT_M)
-            self.scenery.add(site, -1, SIGNAL_SIZE, catalogue.posts[0], WHITE)
-        self._add_houses()
-        self._add_trees()
-        self.solids = np.vstack([self.objects.footprints(), self.scenery.footprints()])
-        self._add_walkers()
+        parked = self._parked()
+        signs = self._signs()
+        lights = [Thing(at, SIGNAL, SIGNAL_SIZE, catalogue.signals[GREEN], WHITE, SIGNAL_HEIGHT_M) for at in signals]
+        posts = [_standing(thing.site, -1, SIGN_SIZE, catalogue.posts[1], WHITE) for thing in signs]
+        posts += [_standing(at, -1, SIGNAL_SIZE, catalogue.posts[0], WHITE) for at in signals]
+        still = [*parked, *signs, *lights]
+        self.scenery = Things.of([*posts, *self._houses(), *self._trees()])
+        self.solids = np.vstack([Things.of(still).footprints(), self.scenery.footprints()])
+        self.objects = Things.of([*still, *self._pedestrians()])
 
     def step(self, dt: float, time: float, road_is_safe: Callable[[Array], bool], held_back: set[int]) -> None:
         """Move pedestrians and switch signals.
@@ -207,9 +217,12 @@ class Street:
             held_back: crossings on whose arm traffic must yield now.
         """
         first = len(self.objects) - len(self.walkers)
-        for k, walker in enumerate(self.walkers, first):
+        for walker in self.walkers:
             walker.walk(dt, road_is_safe)
-            self.objects.positions[k], self.objects.headings[k] = walker.site()
+        if self.walkers:
+            self.objects.positions[first:], self.objects.headings[first:] = zip(
+                *(walker.site() for walker in self.walkers), strict=True
+            )
         stopped = held_back | {walker.crossing for walker in self.walkers if walker.on_road}
         for k, signal in enumerate(self.signals, first - len(self.signals)):
             by_clock = signal.crossing < 0 and (time + 3.7 * k) % 11.0 > 5.5
@@ -220,7 +233,7 @@ class Street:
         """(n, 2) m/s of the objects."""
         out = np.zeros((len(self.objects), 2))
         first = len(self.objects) - len(self.walkers)
-        speeds, headings = np.array([walker.speed for walker in self.walkers]), np.array(self.objects.headings[first:])
+        speeds, headings = np.array([walker.speed for walker in self.walkers]), self.objects.headings[first:]
         out[first:, 0], out[first:, 1] = speeds * np.cos(headings), speeds * np.sin(headings)
         return out
 
@@ -240,48 +253,58 @@ class Street:
                 sites.append(site)
         return sites
 
-    def _add_parked(self) -> None:
+    def _parked(self) -> list[Thing]:
+        found = []
         for _ in range(self._params.n_parked):
             kind = draw_kind(self._rng, parked=True)
             site = self._site(0.0, BAY_M / 2, KINDS[kind].size[0] / 2 + 0.5, parking=True)
             if site is not None:
                 mesh, tint = draw_paint(self._rng, kind, self._params.look_alike_fraction)
-                self.objects.add(site, KINDS[kind].object_class, KINDS[kind].size, mesh, tint)
+                found.append(_standing(site, KINDS[kind].object_class, KINDS[kind].size, mesh, tint))
+        return found
 
-    def _add_signs(self) -> None:
+    def _signs(self) -> list[Thing]:
+        found = []
         common, *rare = self._catalogue.signs
         for _ in range(self._params.n_signs):
             site = self._site(math.pi, POST_M, 1.0)
             if site is not None:
                 usual = self._rng.uniform() < self._params.look_alike_fraction
                 mesh = common if usual else rare[int(self._rng.integers(len(rare)))]
-                self.objects.add(site, SIGN, SIGN_SIZE, mesh, WHITE, SIGN_HEIGHT_M)
-                self.scenery.add(site, -1, SIGN_SIZE, self._catalogue.posts[1], WHITE)
+                found.append(Thing(site, SIGN, SIGN_SIZE, mesh, WHITE, SIGN_HEIGHT_M))
+        return found
 
-    def _add_houses(self) -> None:
+    def _houses(self) -> list[Thing]:
+        found = []
         for _ in range(self._params.n_buildings):
             k = int(self._rng.integers(len(self._catalogue.houses)))
             length, depth = self._catalogue.footprints[k]
             outward = BAY_M + PAVEMENT_M + 1.0 + depth / 2
             site = self._site(math.pi, outward, 0.55 * length, wider=2.0, room=outward + depth / 2 - 1.0)
             if site is not None:
-                self.scenery.add(site, -1, (length, depth, 0.0), self._catalogue.houses[k], draw(self._rng, WALLS))
+                wall = draw(self._rng, WALLS)
+                found.append(_standing(site, -1, (length, depth, 0.0), self._catalogue.houses[k], wall))
+        return found
 
-    def _add_trees(self) -> None:
+    def _trees(self) -> list[Thing]:
+        found = []
         for _ in range(self._params.n_trees):
             outward = BAY_M + PAVEMENT_M + float(self._rng.uniform(0.2, 4.0))
             site = self._site(float(self._rng.uniform(0, 6)), outward, 1.3, wider=2.0, islands=True)
             if site is not None:
                 mesh = self._catalogue.trees[int(self._rng.integers(len(self._catalogue.trees)))]
-                self.scenery.add(site, -1, (0.4, 0.4, 0.0), mesh, draw(self._rng, LEAVES))
+                found.append(_standing(site, -1, (0.4, 0.4, 0.0), mesh, draw(self._rng, LEAVES)))
+        return found
 
-    def _add_walkers(self) -> None:
+    def _pedestrians(self) -> list[Thing]:
+        found = []
         for _ in range(self._params.n_pedestrians):
             walker = self._draw_walker()
             if walker is not None:
                 self.walkers.append(walker)
-                tint = draw_coat(self._rng, self._params.look_alike_fraction)
-                self.objects.add(walker.site(), PEDESTRIAN, PERSON_SIZE, self._catalogue.person, tint)
+                coat = draw_coat(self._rng, self._params.look_alike_fraction)
+                found.append(_standing(walker.site(), PEDESTRIAN, PERSON_SIZE, self._catalogue.person, coat))
+        return found
 
     def _draw_walker(self) -> Walker | None:
         rng, ground = self._rng, self._ground
@@ -326,3 +349,8 @@ class Street:
         """How busy each place (k, 2) is: a Gaussian of its distance from the focus."""
         distance = np.hypot(*(places - self._ground.focus).T)
         return np.exp(-0.5 * (distance / (wider * self._params.street_spread_m)) ** 2) + 1e-9
+
+
+def _standing(site: Site, kind: int, size: Size, mesh: int, tint: Tint) -> Thing:
+    """A thing that stands on the ground."""
+    return Thing(site, kind, size, mesh, tint, size[2] / 2)
