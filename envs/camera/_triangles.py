@@ -109,8 +109,11 @@ def draw_bodies(
         base, end = first_vertex[mesh], first_vertex[mesh + 1]
         body = projected[:, : end - base]
         _project(vertices[:, base:end], R, t, camera, body)
-        in_front, left, right, top, bottom = _bounds(body, near, float(width), float(height))
+        closest, left, right, top, bottom = _bounds(body, near, float(width), float(height))
         if left >= right or top >= bottom:
+            continue
+        in_front = closest >= near
+        if in_front and _is_hidden(closest, int(left), ceil(right), int(top), ceil(bottom), inverse_depth):
             continue
         for row in range(int(top), ceil(bottom)):
             spans[row, 0] = min(spans[row, 0], int(left))
@@ -127,10 +130,12 @@ def draw_bodies(
                 x0, y0 = projected[3, i], projected[4, i]
                 x1, y1 = projected[3, j], projected[4, j]
                 x2, y2 = projected[3, k], projected[4, k]
-                # Most faces of a far body lie between the sample points.
-                if ceil(min(x0, min(x1, x2))) >= ceil(max(x0, max(x1, x2))):
+                # Most faces of a far body lie between the sample points, or are hidden.
+                first, last = max(ceil(min(x0, min(x1, x2))), 0), min(ceil(max(x0, max(x1, x2))), width)
+                if first >= last:
                     continue
-                if ceil(min(y0, min(y1, y2))) >= ceil(max(y0, max(y1, y2))):
+                high, low = max(ceil(min(y0, min(y1, y2))), 0), min(ceil(max(y0, max(y1, y2))), height)
+                if high >= low or _is_hidden(closest, first, last, high, low, inverse_depth):
                     continue
             else:
                 corners = _project_face(i, j, k, projected, near, fx, fy, cx, cy, offset_u, offset_v, polygon)
@@ -234,9 +239,10 @@ def draw_shadows(geometry, body_mesh, body_poses, look, camera, light, projected
         base, end = first_vertex[mesh], first_vertex[mesh + 1]
         body = projected[:, : end - base]
         _project_shadow(vertices[:, base:end], pose, slope_x, slope_y, camera, body)
-        in_front, left, right, top, bottom = _bounds(body, camera[18], float(width), float(height))
+        closest, left, right, top, bottom = _bounds(body, camera[18], float(width), float(height))
         if left >= right or top >= bottom:
             continue
+        in_front = closest >= camera[18]
         for row in range(int(top), ceil(bottom)):
             spans[row, 0] = min(spans[row, 0], int(left))
             spans[row, 1] = max(spans[row, 1], ceil(right))
@@ -364,7 +370,7 @@ def _project_shadow(vertices, pose, slope_x, slope_y, camera, out):
 
 @njit(cache=True, error_model="numpy")
 def _bounds(body, near, width, height):
-    """Whether a projected body (5, v) is beyond the near plane, and its first and last column and row in the image.
+    """Least depth of a projected body (5, v), and its first and last column and row in the image.
 
     Part of a body before the near plane may be anywhere.
     """
@@ -374,8 +380,19 @@ def _bounds(body, near, width, height):
         u, v = body[3, k], body[4, k]
         left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
     if closest < near:
-        return False, 0.0, width, 0.0, height
-    return True, max(left, 0.0), min(right, width), max(top, 0.0), min(bottom, height)
+        return closest, 0.0, width, 0.0, height
+    return closest, max(left, 0.0), min(right, width), max(top, 0.0), min(bottom, height)
+
+
+@njit(cache=True, error_model="numpy")
+def _is_hidden(closest, left, right, top, bottom, inverse_depth):
+    """Whether every pixel of a rectangle shows something nearer than `closest` m, behind which nothing is seen."""
+    nearest = np.float32(1.00001 / closest)
+    for row in range(top, bottom):
+        for column in range(left, right):
+            if inverse_depth[row, column] < nearest:
+                return False
+    return True
 
 
 @njit(cache=True, error_model="numpy", inline="always")
