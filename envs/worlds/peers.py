@@ -8,7 +8,7 @@ Either way TinyRenderer draws, without shadows, and gives RGB, depth buffer and 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from .bullet import BodyState, BoxDynamics
 from .multi_robot import MultiRobotParams, MultiRobotWorld
+from .robots import RobotWorld
 from .wheels import WheelDynamics
 from .world import Array, Mesh
 
@@ -75,6 +76,14 @@ class TinyPeer:
         """A new scene, and what its cameras see."""
         self.world.reset(rng)
         self._dynamics.show(self.world.save_state().state.bodies)
+        return self.images()
+
+    def follow(self, world: RobotWorld) -> list[TinyImages]:
+        """The present scene of another multi_robot world of the same parameters, its robots standing still."""
+        saved = world.save_state()
+        bodies = self._dynamics.rest(saved.state.bodies.planar)
+        self.world.restore_state(replace(saved, state=replace(saved.state, bodies=bodies)))
+        self._dynamics.show(bodies)
         return self.images()
 
     def step(self, controls: Array) -> list[TinyImages]:
