@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import cos, sin, sqrt
+from math import sqrt
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ..matching.pose import Array
+from ..matching.pose import Array, rotation_from_vector
 
 MAX_DEPTH_M = 1000.0
 """Depth images report the sky at this depth."""
@@ -38,20 +38,19 @@ class PoseNoise:
 
     def covariance(self, up: Array) -> Array:
         """Covariance (6, 6) of the reported pose, right perturbation; `up` (3,) in the camera frame."""
-        out = np.zeros((6, 6))
-        out[0, 0] = out[1, 1] = out[2, 2] = self.position_m**2
-        out[3:, 3:] = self.heading_rad**2 * (up[:, None] * up)
-        return out
+        return _covariance(up, self.position_m**2, self.heading_rad**2)
 
     def pose(self, T_world_camera: Array, rng: np.random.Generator) -> Array:
-        """A reported pose (4, 4)."""
+        """A reported pose (4, 4), of which the true one is a right perturbation, as the covariance is understood."""
         normal = rng.standard_normal(4)
-        return _reported(T_world_camera, self.position_m, self.heading_rad, normal)
+        turn = rotation_from_vector(-self.heading_rad * normal[3] * T_world_camera[2, :3])
+        return _perturbed(T_world_camera, turn, -self.position_m, normal, True)
 
     def odometry(self, T_world_last: Array, T_world_now: Array, rng: np.random.Generator) -> Array:
         """Reported own motion (4, 4): the present camera frame in the last one."""
         normal = rng.standard_normal(4)
-        return _travelled(T_world_last, T_world_now, self.odometry_position, self.odometry_heading_rad, normal)
+        turn = rotation_from_vector(self.odometry_heading_rad * normal[3] * T_world_now[2, :3])
+        return _travelled(T_world_last, T_world_now, turn, self.odometry_position, normal)
 
 
 def up_in_camera(T_world_camera: Array) -> Array:
@@ -60,58 +59,42 @@ def up_in_camera(T_world_camera: Array) -> Array:
 
 
 @njit(cache=True)
-def _reported(T: Array, position_m: float, heading_rad: float, normal: Array) -> Array:
-    """A pose (4, 4) with errors drawn as standard normal numbers (4,), of the position and about the vertical.
-
-    The error is a right perturbation of the report, truth = reported * exp(xi), as the covariance is understood.
-    """
-    angle = heading_rad * normal[3]
-    turn = _rotation(T[2, 0] * angle, T[2, 1] * angle, T[2, 2] * angle)
-    out = np.zeros((4, 4))
-    out[3, 3] = 1.0
+def _covariance(up: Array, position_m2: float, heading_rad2: float) -> Array:
+    out = np.zeros((6, 6))
     for i in range(3):
+        out[i, i] = position_m2
         for j in range(3):
-            out[i, j] = T[i, 0] * turn[j, 0] + T[i, 1] * turn[j, 1] + T[i, 2] * turn[j, 2]
-        shift = position_m * (out[i, 0] * normal[0] + out[i, 1] * normal[1] + out[i, 2] * normal[2])
-        out[i, 3] = T[i, 3] - shift
+            out[3 + i, 3 + j] = heading_rad2 * (up[i] * up[j])
     return out
 
 
 @njit(cache=True)
-def _travelled(T_last: Array, T_now: Array, position: float, heading_rad: float, normal: Array) -> Array:
-    """The pose (4, 4) of the present in the last frame, the motion's errors drawn as `_reported` takes them."""
-    motion, moved = np.empty((3, 3)), np.empty(3)
+def _perturbed(T: Array, turn: Array, position_m: float, normal: Array, turned: bool) -> Array:
+    """A pose (4, 4) turned by a rotation on its right, and moved by `position_m` times each of `normal` along its axes.
+
+    The axes are those after the turn if `turned`, else those before.
+    """
+    out = np.zeros((4, 4))
+    out[3, 3] = 1.0
+    axes = out if turned else T
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = T[i, 0] * turn[0, j] + T[i, 1] * turn[1, j] + T[i, 2] * turn[2, j]
+        out[i, 3] = T[i, 3] + position_m * (axes[i, 0] * normal[0] + axes[i, 1] * normal[1] + axes[i, 2] * normal[2])
+    return out
+
+
+@njit(cache=True)
+def _travelled(T_last: Array, T_now: Array, turn: Array, position: float, normal: Array) -> Array:
+    """The pose (4, 4) of the present in the last frame, turned and moved, the latter as a share of its length."""
+    motion = np.zeros((4, 4))
     for i in range(3):
         for j in range(3):
             motion[i, j] = T_last[0, i] * T_now[0, j] + T_last[1, i] * T_now[1, j] + T_last[2, i] * T_now[2, j]
-        moved[i] = 0.0
         for k in range(3):
-            moved[i] += T_last[k, i] * (T_now[k, 3] - T_last[k, 3])
-    error = position * sqrt(moved[0] ** 2 + moved[1] ** 2 + moved[2] ** 2)
-    angle = heading_rad * normal[3]
-    turn = _rotation(T_now[2, 0] * angle, T_now[2, 1] * angle, T_now[2, 2] * angle)
-    out = np.zeros((4, 4))
-    out[3, 3] = 1.0
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = motion[i, 0] * turn[0, j] + motion[i, 1] * turn[1, j] + motion[i, 2] * turn[2, j]
-        shift = motion[i, 0] * normal[0] + motion[i, 1] * normal[1] + motion[i, 2] * normal[2]
-        out[i, 3] = moved[i] + error * shift
-    return out
-
-
-@njit(cache=True)
-def _rotation(x: float, y: float, z: float) -> Array:
-    """`matching.pose.rotation_from_vector` of (x, y, z)."""
-    angle = sqrt(x * x + y * y + z * z)
-    s, c = (1.0, 0.5) if angle < 1e-8 else (sin(angle) / angle, (1.0 - cos(angle)) / angle**2)
-    return np.array(
-        [
-            [1.0 - c * (y * y + z * z), c * x * y - s * z, c * x * z + s * y],
-            [c * x * y + s * z, 1.0 - c * (x * x + z * z), c * y * z - s * x],
-            [c * x * z - s * y, c * y * z + s * x, 1.0 - c * (x * x + y * y)],
-        ]
-    )
+            motion[i, 3] += T_last[k, i] * (T_now[k, 3] - T_last[k, 3])
+    length = sqrt(motion[0, 3] ** 2 + motion[1, 3] ** 2 + motion[2, 3] ** 2)
+    return _perturbed(motion, turn, position * length, normal, False)
 
 
 def permuted_instances(

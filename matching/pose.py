@@ -8,9 +8,10 @@ is thus expressed in frame b.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import sqrt
+from math import cos, sin, sqrt
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -27,13 +28,22 @@ def skew(v: Array) -> Array:
 
 
 def rotation_from_vector(w: Array) -> Array:
-    """Rotation (3, 3) about the axis w by the angle |w| in radians (Rodrigues)."""
-    w = np.asarray(w, dtype=np.float64)
-    angle = sqrt(w.dot(w))
-    K = skew(w)
-    if angle < 1e-8:
-        return _EYE3 + K + 0.5 * K @ K
-    return _EYE3 + np.sin(angle) / angle * K + (1.0 - np.cos(angle)) / angle**2 * K @ K
+    """Rotation (3, 3) about the axis w (3,) by the angle |w| in radians (Rodrigues)."""
+    return _rodrigues(np.asarray(w, dtype=np.float64))
+
+
+@njit(cache=True)
+def _rodrigues(w: Array) -> Array:
+    x, y, z = w[0], w[1], w[2]
+    angle = sqrt(x * x + y * y + z * z)
+    s, c = (1.0, 0.5) if angle < 1e-8 else (sin(angle) / angle, (1.0 - cos(angle)) / angle**2)
+    return np.array(
+        [
+            [1.0 - c * (y * y + z * z), c * x * y - s * z, c * x * z + s * y],
+            [c * x * y + s * z, 1.0 - c * (x * x + z * z), c * y * z - s * x],
+            [c * x * z - s * y, c * y * z + s * x, 1.0 - c * (x * x + y * y)],
+        ]
+    )
 
 
 def exp_se3(xi: Array) -> Array:
