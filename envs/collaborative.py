@@ -19,17 +19,16 @@ from pettingzoo import ParallelEnv
 
 from .camera.effects import EffectRanges
 from .camera.frame import Frame as CameraFrame
-from .camera.frame import Memory
 from .camera.mount import Mount, checked_mounts, kept_picture, with_mounts
 from .camera.raster import Look, intrinsics_from_fov
 from .camera.rig import CameraRig, Exposures
 from .claims import Claims, action_space, decode
 from .figures import N_SUMS, figures, sums
 from .instant import Answered, Instant
-from .observations import SENSORS, message_leaves, observation_space
+from .observations import SENSORS, Observer, state_size, state_vector
 from .scoring import LocalizationReward, Reward, StepScore, Truth, score, tight_boxes
 from .seeding import EpisodeSeeds, Seed
-from .sensing import MAX_DEPTH_M, PoseNoise, permuted_instances, up_in_camera
+from .sensing import PoseNoise
 from .worlds.world import Snapshot, World
 
 
@@ -209,17 +208,23 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
             effects=effects,
             own_body=[m is not None and m.own_body for m in self.mounts],
         )
-        self._images = Memory(3 * self.width * self.height)
+        self._observer = Observer(
+            self.world,
+            self.intrinsics,
+            self.width,
+            self.height,
+            self.max_detections,
+            sensors=self.sensors,
+            messages=self.messages,
+            noise=self.pose_noise,
+        )
         self._painter: Any = None
         self._window: Any = None
         self._episode: _Episode | None = None
         space = action_space(self.world.control_size, self.max_detections, n - 1, self.width, self.height)
         self.action_spaces = dict.fromkeys(self.possible_agents, space)
-        observation = observation_space(
-            self.world, self.width, self.height, self.max_detections, self.sensors, messages=self.messages
-        )
-        self.observation_spaces = dict.fromkeys(self.possible_agents, observation)
-        self.state_space = spaces.Box(-np.inf, np.inf, (self._state_size(),), np.float64)
+        self.observation_spaces = dict.fromkeys(self.possible_agents, self._observer.space)
+        self.state_space = spaces.Box(-np.inf, np.inf, (state_size(self.world),), np.float64)
 
     # Spaces
 
@@ -401,32 +406,11 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
 
     def _observe(self, episode: _Episode) -> dict[str, Any]:
         episode.mark()
-        return {agent: self._observe_one(i, episode) for i, agent in enumerate(self.possible_agents)}
-
-    def _observe_one(self, i: int, episode: _Episode) -> dict[str, NDArray[Any]]:
-        snapshot, frame = episode.now.snapshot, episode.now.frames[i]
-        T = snapshot.T_world_camera[i]
-        last = T if episode.before is None else episode.before.snapshot.T_world_camera[i]
-        up = up_in_camera(T)
-        out: dict[str, NDArray[Any]] = {}
-        if "image" in self.sensors:
-            out["image"] = self._images.take().reshape(frame.rgb.shape)
-            out["image"][:] = frame.rgb
-        out["intrinsics"] = self.intrinsics[i].astype(np.float32)
-        out["pose"] = self.pose_noise.pose(T, episode.noise_rng).astype(np.float32)
-        out["pose_covariance"] = self.pose_noise.covariance(up).astype(np.float32)
-        out["up"] = up.astype(np.float32)
-        out["odometry"] = self.pose_noise.odometry(last, T, episode.noise_rng).astype(np.float32)
-        out["state"] = snapshot.robot_state[i].astype(np.float32)
-        if "depth" in self.sensors:
-            out["depth"] = np.minimum(frame.depth, np.float32(MAX_DEPTH_M))
-        if "instances" in self.sensors:
-            out["instances"], out["instance_classes"] = permuted_instances(
-                frame.instances, snapshot.object_class, self.world.max_objects, episode.id_rng
-            )
-        if self.messages:
-            out |= message_leaves(i, episode.claims)
-        return out
+        e = episode
+        return {
+            agent: self._observer.observe(i, e.now, e.before, e.claims, e.noise_rng, e.id_rng)
+            for i, agent in enumerate(self.possible_agents)
+        }
 
     def _infos(self, episode: _Episode) -> dict[str, dict[str, float]]:
         """Figures of the last step's claims, and `episode_*` over the episode so far.
@@ -485,25 +469,10 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         """The rig that takes the pictures, and this episode's exposures, for measuring it alone."""
         return self._rig, self._running("cameras()").exposures
 
-    def _state_size(self) -> int:
-        return 13 * self.world.max_objects + self.world.n_robots * (16 + self.world.state_size)
-
     def state(self) -> NDArray[np.float64]:
         """Global state: per object [present, class, x, y, z, vx, vy, vz, heading, length, width, height, identity],
         zero-padded to `max_objects`; then per robot T_world_camera row by row and its own state."""
-        snapshot = self.snapshot()
-        m = len(snapshot.identity)
-        table = np.zeros((self.world.max_objects, 13))
-        table[:m, 0] = 1
-        table[:m, 1] = snapshot.object_class
-        table[:m, 2:5] = snapshot.positions
-        table[:m, 5:8] = snapshot.velocities
-        table[:m, 8] = snapshot.headings
-        table[:m, 9:12] = snapshot.sizes
-        table[:m, 12] = snapshot.identity
-        n = self.world.n_robots
-        robots = np.concatenate([snapshot.T_world_camera.reshape(n, 16), snapshot.robot_state], axis=1)
-        return np.concatenate([table.ravel(), robots.ravel()])
+        return state_vector(self.snapshot(), self.world.max_objects)
 
     # Pictures
 
