@@ -139,7 +139,7 @@ def _leaf(agent: str, name: str, action: Mapping[str, Any], space: spaces.Space)
 
 
 @njit(cache=True)
-def _within(values, low, high):  # type: ignore[no-untyped-def]
+def _within(values: NDArray[np.float64], low: NDArray[np.float32], high: NDArray[np.float32]) -> bool:
     """Whether all values (n,) are in [low, high]; NaN is not."""
     for i in range(len(values)):  # noqa: SIM110 - Numba knows no all()
         if not low[i] <= values[i] <= high[i]:
@@ -148,7 +148,7 @@ def _within(values, low, high):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _counted(values, counts):  # type: ignore[no-untyped-def]
+def _counted(values: NDArray[np.int64], counts: NDArray[np.int64]) -> bool:
     """Whether all values (n,) are in 0..counts-1."""
     for i in range(len(values)):  # noqa: SIM110
         if not 0 <= values[i] < counts[i]:

@@ -112,7 +112,7 @@ def blend(picture: Image, mask: NDArray[Any], color: Color, alpha: float = 1.0) 
 
 
 @njit(cache=True)
-def _blend(picture, mask, color, alpha):  # type: ignore[no-untyped-def]
+def _blend(picture: Image, mask: NDArray[np.float32], color: NDArray[np.float32], alpha: np.float32) -> None:
     for v in range(picture.shape[0]):
         for u in range(picture.shape[1]):
             weight = alpha * mask[v, u]

@@ -269,7 +269,16 @@ def _blurred(rgb: NDArray[np.uint8], sigma: float) -> NDArray[np.uint8]:
 
 
 @njit(cache=True, error_model="numpy")
-def _bend(source, wide_rgb, wide_depth, wide_instances, rgb, depth, instances):  # type: ignore[no-untyped-def]
+def _bend(
+    source: NDArray[np.float32],
+    wide_rgb: NDArray[np.uint8],
+    wide_depth: NDArray[np.float32],
+    wide_instances: NDArray[np.int32],
+    rgb: NDArray[np.uint8],
+    depth: NDArray[np.float32],
+    instances: NDArray[np.int32],
+) -> None:
+    """Look pixels up at (u, v) = source (H, W, 2) of the wide picture: colours between four, else the nearest."""
     height, width = depth.shape
     tall, wide = wide_depth.shape
     f32 = np.float32
@@ -290,7 +299,7 @@ def _bend(source, wide_rgb, wide_depth, wide_instances, rgb, depth, instances): 
 
 
 @njit(cache=True, error_model="numpy")
-def _blur(rgb, weights, out):  # type: ignore[no-untyped-def]
+def _blur(rgb: NDArray[np.uint8], weights: NDArray[np.float32], out: NDArray[np.uint8]) -> None:
     """Separable blur, first along rows and then along columns; the border repeats."""
     height, width, _ = rgb.shape
     reach = len(weights) // 2
@@ -318,7 +327,18 @@ def _blur(rgb, weights, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _expose(rgb, gain, contrast, vignette, read_noise, shot_noise, normal, offsets, out):  # type: ignore[no-untyped-def]
+def _expose(
+    rgb: NDArray[np.uint8],
+    gain: Array,
+    contrast: float,
+    vignette: float,
+    read_noise: float,
+    shot_noise: float,
+    normal: NDArray[np.float32],
+    offsets: NDArray[np.int64],
+    out: NDArray[np.uint8],
+) -> None:
+    """Vignette, gain (3,), contrast and noise; row r takes its normal numbers from place `offsets[r]` on."""
     height, width, _ = rgb.shape
     f32 = np.float32
     read, shot = f32(read_noise**2), f32(shot_noise**2 / 255.0)

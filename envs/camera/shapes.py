@@ -247,7 +247,14 @@ def corner_normals(body: Mesh, crease_rad: float = CREASE_RAD) -> Array:
 
 
 @njit(cache=True)
-def _average_near(order, place, flat, angles, least_cosine, corners):  # type: ignore[no-untyped-def]
+def _average_near(
+    order: NDArray[np.int64],
+    place: NDArray[np.int64],
+    flat: Array,
+    angles: Array,
+    least_cosine: float,
+    corners: Array,
+) -> None:
     """Average normals over corners at one place, weighted by their angles; `order` (3 f,) sorts corners by `place`."""
     first = 0
     while first < len(order):
