@@ -24,7 +24,7 @@ from .road_surface import road_surface
 from .street import Catalogue, Street
 from .street_meshes import barrier, building, bus, car, person, post, sign, signal, tree, truck, van
 from .traffic import ConnectedVehicle, FastNetwork, FastRoad, Obstacle, TrafficVehicle, make_road
-from .traffic_kernels import corners, rectangles_intersect
+from .traffic_kernels import touching
 from .world import Array, Light, Mesh, SceneGenerationError, Snapshot
 
 SIMULATION_HZ = 15
@@ -371,23 +371,6 @@ def planar_poses(positions: Array, headings: Array) -> Array:
     poses[:, 2, 2] = poses[:, 3, 3] = 1.0
     poses[:, :2, 3] = positions
     return poses
-
-
-@njit(cache=True)
-def touching(cars: Array, bodies: Array) -> NDArray[np.bool_]:
-    """(n,) whether each rectangle of cars (n, 5) x, y, heading, length, width overlaps any of bodies (k, 5)."""
-    out = np.zeros(len(cars), dtype=np.bool_)
-    for i in range(len(cars)):
-        x, y, heading, length, width = cars[i]
-        for j in range(len(bodies)):
-            u, v, turn, long, wide = bodies[j]
-            if math.hypot(u - x, v - y) > (math.hypot(length, width) + math.hypot(long, wide)) / 2:
-                continue
-            now, _ = rectangles_intersect(
-                corners(x, y, heading, length, width), corners(u, v, turn, long, wide), 0.0, 0.0, 0.0, 0.0
-            )
-            out[i] |= now
-    return out
 
 
 @njit(cache=True)

@@ -395,6 +395,23 @@ def collisions(bodies: Array, n: int, dt: float) -> Ints:
     return out
 
 
+@njit(cache=True)
+def touching(cars: Array, bodies: Array) -> NDArray[np.bool_]:
+    """(n,) whether each rectangle of cars (n, 5) x, y, heading, length, width overlaps any of bodies (k, 5)."""
+    out = np.zeros(len(cars), dtype=np.bool_)
+    for i in range(len(cars)):
+        x, y, heading, length, width = cars[i]
+        for j in range(len(bodies)):
+            u, v, turn, long, wide = bodies[j]
+            if math.hypot(u - x, v - y) > (math.hypot(length, width) + math.hypot(long, wide)) / 2:
+                continue
+            now, _ = rectangles_intersect(
+                corners(x, y, heading, length, width), corners(u, v, turn, long, wide), 0.0, 0.0, 0.0, 0.0
+            )
+            out[i] |= now
+    return out
+
+
 # --- right of way --------------------------------------------------------------------------------------------------
 
 

@@ -417,6 +417,29 @@ def test_peers_show_the_same_scene() -> None:
     world.close()
 
 
+@pytest.mark.parametrize("stock", [False, True])
+def test_a_peer_plays_the_scene_of_another_world(stock: bool) -> None:
+    params = speed_params(3)
+    world, peer = MultiRobotWorld(2, params), TinyPeer(width=64, height=48, stock=stock, params=params)
+    peer.reset(np.random.default_rng(1))
+    peer.step(np.ones((2, 2)))
+    world.reset(np.random.default_rng(0))
+    images = peer.follow(world)
+    here, there = world.snapshot(), peer.world.snapshot()
+    assert np.allclose(there.body_poses, here.body_poses, atol=1e-12)
+    again = peer.follow(world)
+    assert all((a.rgb == b.rgb).all() for a, b in zip(images, again, strict=True))
+    controls = np.tile([0.5, 0.0], (2, 1))
+    world.step(controls)
+    peer.step(controls)
+    moved = world.snapshot().positions - here.positions
+    assert np.linalg.norm(moved[:2], axis=1) == pytest.approx(0.2 * 0.5 * params.max_speed_mps, rel=0.01)
+    if not stock:
+        assert np.allclose(peer.world.snapshot().positions, world.snapshot().positions, atol=1e-9)
+    peer.close()
+    world.close()
+
+
 def test_the_stock_peer_steps_and_sees() -> None:
     peer = TinyPeer(width=64, height=48, stock=True, params=speed_params(2))
     before = peer.reset(np.random.default_rng(0))[0]
