@@ -13,123 +13,83 @@ from .pose import Array
 NEGLIGIBLE = 1e-12
 """Affinities below this share of the largest are taken for zero: most distances do not agree at all."""
 
-Columns = NDArray[np.uint16]
-"""Candidates have 16-bit numbers here: what a step of the walk costs is the memory that it reads."""
+BLOCK = 16
+"""Windows begin and end at multiples of this: as many single-precision numbers fill the widest vector register."""
+
+Single = NDArray[np.float32]
 
 
 class Affinity(NamedTuple):
-    """A symmetric affinity (k, k) by rows: `start` (k + 1,) into the columns and values of what is not negligible."""
+    """Affinities D_ab a_a a_b of every two candidates a = (i, i'), b = (j, j'), by windows, in single precision.
 
+    With the pairs of target objects in ascending order of distance, those that agree with the distance of i and j are
+    neighbours: a window, to be multiplied as a whole, without looking up where its entries belong.
+
+    Attributes:
+        weight: (n, n') a.
+        diagonal: (n, n') affinity of a candidate with itself.
+        first, second: (t,) the pairs i' < j' of target objects by distance, and copies of the last up to a whole block.
+        low, high: (n, n) blocks where the window of i and j begins and ends.
+        start: (n, n) where its entries begin in `value`; i, j and j, i have the same.
+        value: D.
+    """
+
+    weight: Array
+    diagonal: Array
+    first: NDArray[np.int64]
+    second: NDArray[np.int64]
+    low: NDArray[np.int64]
+    high: NDArray[np.int64]
     start: NDArray[np.int64]
-    column: Columns
-    value: Array
+    value: Single
 
 
-def distance_affinity(s: Array, t: Array, width_m2: float, a: Array, diagonal: bool) -> Affinity:
-    """`candidates.affinity_matrix` of candidates i n' + i' without ever holding it: entries D_ab a_a a_b.
+def distance_affinity(s: Array, t: Array, width_m2: float, weight: Array, diagonal: Array) -> Affinity:
+    """The affinities of all candidates, D of Eq. (2) times the weights of both.
 
     Args:
         s, t: (n, n) and (n', n') m, distances within both graphs.
         width_m2: gamma of Eq. (2).
-        a: (n n',) similarity of each candidate, in [0, 1].
-        diagonal: whether `a` itself is the diagonal; else it is 0.
-
-    Raises:
-        ValueError: more than 65,536 candidates.
+        weight: (n, n') of each candidate, in [0, 1].
+        diagonal: (n, n') affinity of each candidate with itself.
     """
-    if len(a) > 1 << 16:
-        raise ValueError(f"an affinity has at most {1 << 16} candidates, got {len(a)}")
-    start, column, value = _agreeing(s, t, np.sqrt(-np.log(NEGLIGIBLE) * width_m2), a > NEGLIGIBLE)
-    value *= -1.0 / width_m2
+    first, second = np.triu_indices(len(t), 1)
+    distance = t[first, second]
+    order = np.argsort(distance, kind="stable")
+    fill = (0, -len(order) % BLOCK)
+    ascending = np.pad(distance[order], fill, constant_values=np.inf)
+    reach = np.sqrt(-np.log(NEGLIGIBLE) * width_m2)
+    low = np.searchsorted(ascending, s - reach) // BLOCK
+    high = -(-np.searchsorted(ascending, s + reach, side="right") // BLOCK)
+    start, value = _exponents(s, ascending, width_m2, low, high)
     np.exp(value, out=value)
-    _weigh(start, column, value, a, diagonal)
-    return Affinity(start, column, value)
+    return Affinity(weight, diagonal, np.pad(first[order], fill), np.pad(second[order], fill), low, high, start, value)
 
 
 @njit(cache=True)
-def _agreeing(s: Array, t: Array, reach: float, usable: NDArray[np.bool_]) -> tuple[NDArray[np.int64], Columns, Array]:
-    """By rows, the usable candidates whose distances differ by at most `reach`, and the squared differences.
-
-    First in each row stands the candidate itself, with 0. With the distances from i and those from i' in ascending
-    order, those that agree with one another form windows that only move forward.
-    """
-    n, m = len(s), len(t)
-    by_s, by_t = _order_of_rows(s), _order_of_rows(t)
-    start = np.zeros(n * m + 1, dtype=np.int64)
-    column, value = np.empty(0, dtype=np.uint16), np.empty(0)
-    for write in (False, True):  # count, then write
-        if write:
-            column, value = np.empty(start[-1], dtype=np.uint16), np.empty(start[-1])
-        for i in range(n):
-            for ii in range(m):
-                row = i * m + ii
-                at = start[row]
-                if write:
-                    column[at], value[at] = row, 0.0
-                at += 1
-                low = high = 0
-                for j in by_s[i]:
-                    if j == i or not usable[row]:
-                        continue
-                    while low < m and t[ii, by_t[ii, low]] < s[i, j] - reach:
-                        low += 1
-                    while high < m and t[ii, by_t[ii, high]] <= s[i, j] + reach:
-                        high += 1
-                    for x in range(low, high):
-                        jj = by_t[ii, x]
-                        if jj == ii or not usable[j * m + jj]:
-                            continue
-                        if write:
-                            column[at], value[at] = j * m + jj, (s[i, j] - t[ii, jj]) ** 2
-                        at += 1
-                if not write:
-                    start[row + 1] = at
-    return start, column, value
-
-
-@njit(cache=True)
-def _order_of_rows(distance: Array) -> NDArray[np.int64]:
-    out = np.empty(distance.shape, dtype=np.int64)
-    for i in range(len(distance)):
-        out[i] = np.argsort(distance[i])
-    return out
-
-
-@njit(cache=True)
-def _weigh(start: NDArray[np.int64], column: Columns, value: Array, a: Array, diagonal: bool) -> None:
-    """Scale rows and columns by a (k,), in place; the first entry of each row is the diagonal."""
-    for row in range(len(a)):
-        for at in range(np.uint64(start[row]), np.uint64(start[row + 1])):
-            value[at] *= a[row] * a[np.uint64(column[at])]
-        value[start[row]] = a[row] if diagonal else 0.0
-
-
-@njit(cache=True)
-def sparse(K: Array) -> Affinity:
-    """The affinity K (k, k), k <= 65,536, without its negligible entries."""
-    k = len(K)
-    least = NEGLIGIBLE * K.max()
-    start = np.zeros(k + 1, dtype=np.int64)
-    for a in range(k):
-        count = 0
-        for b in range(k):
-            count += K[a, b] > least
-        start[a + 1] = start[a] + count
-    # Every entry is written and the next overwrites it if negligible: branches would be guessed wrongly too often.
-    column, value = np.empty(start[k] + 1, dtype=np.uint16), np.empty(start[k] + 1)
-    for a in range(k):
-        at = start[a]
-        for b in range(k):
-            column[at], value[at] = b, K[a, b]
-            at += K[a, b] > least
-    return Affinity(start, column[:-1], value[:-1])
+def _exponents(
+    s: Array, ascending: Array, width_m2: float, low: NDArray[np.int64], high: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], Single]:
+    """Where the window of each two source objects starts, and log D of all."""
+    n = len(s)
+    start = np.zeros((n, n), dtype=np.int64)
+    total = 0
+    for i in range(n):
+        for j in range(i):
+            start[i, j] = start[j, i] = total
+            total += BLOCK * (high[i, j] - low[i, j])
+    value = np.empty(total, dtype=np.float32)
+    for i in range(n):
+        for j in range(i):
+            window = ascending[BLOCK * low[i, j] : BLOCK * high[i, j]]
+            for k in range(len(window)):
+                value[start[i, j] + k] = -((s[i, j] - window[k]) ** 2) / width_m2
+    return start, value
 
 
 @njit(cache=True, fastmath=True)
 def reweighted_random_walk(
     affinity: Affinity,
-    n: int,
-    m: int,
     walk_weight: float = 0.2,
     inflation: float = 30.0,
     iterations: int = 300,
@@ -142,18 +102,18 @@ def reweighted_random_walk(
     A step walks from the mixture of the last visits (weight `walk_weight`) and of those visits inflated and made
     bistochastic (the jump). Zero where there is no affinity at all.
     """
-    size = n * m
-    x = np.full(size, 1.0 / size)
+    n, m = affinity.weight.shape
+    x = np.full((n, m), 1.0 / (n * m))
     before = x.copy()
     mixed = x.copy()
-    start, column, value = affinity
+    partners = np.empty((n, 2, len(affinity.first)), dtype=np.float32)
     for _ in range(iterations):
-        walk = multiply(start, column, value, mixed)
+        walk = multiply(affinity, mixed, partners)
         total = walk.sum()
         if total <= 0.0:
             return np.zeros((n, m))
         walk /= total
-        jump = reweighted(walk, n, m, inflation, sinkhorn_iterations, sinkhorn_tolerance)
+        jump = reweighted(walk, inflation, sinkhorn_iterations, sinkhorn_tolerance)
         mixed = walk_weight * walk + (1.0 - walk_weight) * jump
         # An oscillation between two states counts as an end, too.
         change = min(((walk - x) ** 2).sum(), ((walk - before) ** 2).sum())
@@ -161,29 +121,47 @@ def reweighted_random_walk(
         x[:] = walk
         if change < tolerance * tolerance:
             break
-    return x.reshape(n, m)
+    return x
 
 
 @njit(cache=True, fastmath=True)
-def reweighted(
-    walk: Array, n: int, m: int, inflation: float, sinkhorn_iterations: int, sinkhorn_tolerance: float
-) -> Array:
-    """Where a step jumps, (n m,) of sum 1: the visits inflated, then made bistochastic."""
-    jump = np.exp(inflation * (walk / walk.max() - 1.0)).reshape(n, m)
+def reweighted(walk: Array, inflation: float, sinkhorn_iterations: int, sinkhorn_tolerance: float) -> Array:
+    """Where a step jumps, (n, m) of sum 1: the visits (n, m) inflated, then made bistochastic."""
+    jump = np.exp(inflation * (walk / walk.max() - 1.0))
     sinkhorn(jump, sinkhorn_iterations, sinkhorn_tolerance, np.exp(-inflation))
-    return jump.reshape(n * m) / jump.sum()
+    return jump / jump.sum()
 
 
 @njit(cache=True, fastmath=True)
-def multiply(start: NDArray[np.int64], column: Columns, value: Array, x: Array) -> Array:
-    """The sparse matrix times x (k,)."""
-    out = np.empty(len(x))
-    for a in range(len(x)):
-        total = 0.0
-        # Unsigned, since an index that might count from the end keeps the compiler from using vector instructions.
-        for at in range(np.uint64(start[a]), np.uint64(start[a + 1])):
-            total += value[at] * x[np.uint64(column[at])]
-        out[a] = total
+def multiply(affinity: Affinity, x: Array, partners: Single) -> Array:
+    """The affinity times x (n, n'), both by candidates; `partners` (n, 2, t) is overwritten.
+
+    Along the pairs i', j' of target objects, i collects from every j what is at j, j' (for i, i') and at j, i' (for
+    i, j'). Indices are unsigned, since those that might count from the end keep the compiler from vector instructions.
+    """
+    weight, diagonal, first, second, low, high, start, value = affinity
+    n, pairs = np.uint64(len(x)), np.uint64(len(first))
+    heavy = (weight * x).astype(np.float32)
+    for j in range(n):
+        for k in range(pairs):
+            partners[j, np.uint64(0), k] = heavy[j, np.uint64(second[k])]
+            partners[j, np.uint64(1), k] = heavy[j, np.uint64(first[k])]
+    out = np.empty(x.shape)
+    collected = np.empty((2, len(first)), dtype=np.float32)
+    for i in range(n):
+        collected[:] = 0.0
+        for j in range(n):
+            if i == j:
+                continue
+            from_value = np.uint64(start[i, j]) - np.uint64(BLOCK) * np.uint64(low[i, j])
+            for k in range(np.uint64(BLOCK) * np.uint64(low[i, j]), np.uint64(BLOCK) * np.uint64(high[i, j])):
+                collected[np.uint64(0), k] += value[from_value + k] * partners[j, np.uint64(0), k]
+                collected[np.uint64(1), k] += value[from_value + k] * partners[j, np.uint64(1), k]
+        total = np.zeros(x.shape[1], dtype=np.float32)
+        for k in range(pairs):
+            total[np.uint64(first[k])] += collected[np.uint64(0), k]
+            total[np.uint64(second[k])] += collected[np.uint64(1), k]
+        out[i] = weight[i] * total + diagonal[i] * x[i]
     return out
 
 
@@ -195,35 +173,27 @@ def sinkhorn(X: Array, iterations: int, tolerance: float = 0.0, slack: float = 0
     sum to 1 at once; as equals they stay equal, so one stands for all.
     """
     n, m = X.shape
-    extra = np.full(max(n, m), slack)
-    column = np.empty(m)
+    row, column, total = np.ones(n), np.ones(m), np.empty(m)
+    slack_column = 1.0
     for _ in range(iterations):
         change = 0.0
-        column[:] = 1e-300
-        for i in range(n):
-            total = 1e-300
-            for j in range(m):
-                total += X[i, j]
-            if n > m:
-                total += (n - m) * extra[i]
-                extra[i] /= total
-            for j in range(m):
-                X[i, j] /= total
-                column[j] += X[i, j]
-            change = max(change, abs(total - 1.0))
+        total[:] = 1e-300
         if m > n:
-            total = max(extra[:m].sum(), 1e-300)
-            for j in range(m):
-                extra[j] /= total
-                column[j] += (m - n) * extra[j]
-                extra[j] /= column[j]
-        elif n > m:
-            total = max(extra[:n].sum(), 1e-300)
-            extra[:n] /= total
-        for j in range(m):
-            column[j] = 1.0 / column[j]
+            total += (m - n) / column.sum()
         for i in range(n):
+            before = max(n - m, 0) * slack * slack_column + 1e-300
             for j in range(m):
-                X[i, j] *= column[j]
+                before += X[i, j] * column[j]
+            change = max(change, abs(before * row[i] - 1.0))
+            row[i] = 1.0 / before
+            for j in range(m):
+                total[j] += X[i, j] * row[i]
+        for j in range(m):
+            column[j] = 1.0 / total[j]
+        if n > m:
+            slack_column = 1.0 / max(slack * row.sum(), 1e-300)
         if change < tolerance:
             break
+    for i in range(n):
+        for j in range(m):
+            X[i, j] *= row[i] * column[j]

@@ -10,7 +10,7 @@ from .candidates import extent_floor_m2
 from .graph import ObjectGraph
 from .objective import Terms
 from .pose import Array
-from .random_walk import reweighted_random_walk, sparse
+from .random_walk import distance_affinity, reweighted_random_walk
 from .similarity import attribute_similarity, distances, pair_affinity, triangle_radius, triangle_sides, vertex_cosines
 from .uncertainty import certainty, kronecker_plus, typical
 
@@ -151,15 +151,9 @@ def build(
     uncertainty = source.attribute_variance / width.attribute_unit + source.position_variance / width.position_unit_m2
     # What the objects have in common, Eq. (18) loses when it is normalised over them.
     weight = np.maximum(np.exp(-(uncertainty - uncertainty.min()) / proposal_width), LEAST_WEIGHT)
-    return Problem(terms, table, table_pi, support(terms), weight)
-
-
-def support(terms: Terms) -> Array:
-    """(n, n') how well candidate matches agree with each other in attributes and distances: a random walk's visits."""
-    n, m = terms.attribute.shape
-    affinity = terms.pair.reshape(n * m, n * m).copy()
-    affinity.flat[:: n * m + 1] = terms.attribute.ravel()
-    return reweighted_random_walk(sparse(affinity), n, m, iterations=30, sinkhorn_iterations=10)
+    affinity = distance_affinity(s, t, width.distance_width_m2, w_d, terms.attribute)
+    support = reweighted_random_walk(affinity, iterations=30, sinkhorn_iterations=10)
+    return Problem(terms, table, table_pi, support, weight)
 
 
 def _or(given: float | None, default: float) -> float:

@@ -122,7 +122,7 @@ def hypergraph_walk(
         if total <= 0.0:
             return np.zeros((n, m))
         walk /= total
-        jump = reweighted(walk, n, m, inflation, sinkhorn_iterations, sinkhorn_tolerance)
+        jump = reweighted(walk.reshape(n, m), inflation, sinkhorn_iterations, sinkhorn_tolerance).ravel()
         new = walk_weight * walk + (1.0 - walk_weight) * jump
         change = np.sqrt(((new - x) ** 2).sum())
         x = new

@@ -59,9 +59,7 @@ def rrwm(
     width = distance_width(source, target, s, t, distance_width_m2, distance_width_factor)
     A = attribute_similarity(source.attributes, target.attributes) ** attribute_weight
     visits = reweighted_random_walk(
-        distance_affinity(s, t, width, A.ravel(), attribute_weight > 0),
-        len(source),
-        len(target),
+        distance_affinity(s, t, width, A, A * (attribute_weight > 0)),
         walk_weight,
         inflation,
         iterations,

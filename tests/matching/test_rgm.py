@@ -39,6 +39,25 @@ def matchings(n, m):
                 yield match
 
 
+def test_support_is_the_walk_over_attributes_and_distances():
+    p = make_problem(np.random.default_rng(2), n=5, m=4)
+    K = p.terms.pair.reshape(20, 20) + np.diag(p.terms.attribute.ravel())
+    mixed = np.full(20, 1 / 20)
+    for _ in range(30):
+        walk = K @ mixed
+        walk /= walk.sum()
+        jump = np.full((5, 5), np.exp(-30.0))  # a slack column makes it square
+        jump[:, :4] = np.exp(30.0 * (walk / walk.max() - 1)).reshape(5, 4)
+        for _ in range(10):
+            change = np.abs(jump.sum(axis=1) - 1).max()
+            jump /= jump.sum(axis=1, keepdims=True)
+            jump /= jump.sum(axis=0)
+            if change < 1e-3:
+                break
+        mixed = 0.2 * walk + 0.8 * jump[:, :4].ravel() / jump[:, :4].sum()
+    np.testing.assert_allclose(p.support.ravel(), walk, rtol=1e-4, atol=1e-9)
+
+
 def test_pi_is_the_best_assignment_of_the_active_objects():
     hits = total = 0
     for seed in range(40):

@@ -11,13 +11,13 @@ from covis.matching.candidates import affinity_matrix
 from covis.matching.clipper import consistency, densest_clique
 from covis.matching.icp import _starts, align, rigid, spread_rotations
 from covis.matching.pose import rotation_from_vector
-from covis.matching.random_walk import distance_affinity, reweighted_random_walk, sinkhorn, sparse
+from covis.matching.random_walk import BLOCK, distance_affinity, multiply, reweighted_random_walk, sinkhorn
 from covis.matching.rrwhm import hypergraph_walk, triples
 from covis.matching.similarity import (
-    attribute_similarity,
     contract,
     distances,
     nearest_triples,
+    pair_affinity,
     triangle_distance,
     triangle_radius,
     vertex_cosines,
@@ -72,7 +72,9 @@ def test_sinkhorn_with_slack_is_sinkhorn_of_the_padded_square(shape):
 
 def test_walk_is_the_published_iteration_in_numpy():
     source, target, _ = small(0)
-    K = affinity_matrix(source, target, distances(source.positions), distances(target.positions), 0.5, 1.0)
+    s, t = distances(source.positions), distances(target.positions)
+    A = np.random.default_rng(0).uniform(size=(4, 4))
+    K = pair_affinity(s, t, 0.5).reshape(16, 16) * A.ravel() * A.reshape(-1, 1) + np.diag(A.ravel())
     c, beta, steps = 0.2, 30.0, 7
     mixed = np.full(16, 1 / 16)
     for _ in range(steps):
@@ -83,31 +85,34 @@ def test_walk_is_the_published_iteration_in_numpy():
             jump /= jump.sum(axis=1, keepdims=True)
             jump /= jump.sum(axis=0, keepdims=True)
         mixed = c * walk + (1 - c) * jump.ravel() / jump.sum()
-    np.testing.assert_allclose(
-        reweighted_random_walk(sparse(K), 4, 4, c, beta, steps, 11, 0.0, 0.0).ravel(), walk, atol=1e-12
-    )
+    found = reweighted_random_walk(distance_affinity(s, t, 0.5, A, A), c, beta, steps, 11, 0.0, 0.0)
+    np.testing.assert_allclose(found.ravel(), walk, rtol=1e-5, atol=1e-9)
 
 
-@pytest.mark.parametrize("exponent", [0.0, 1.0, 3.0])
-@pytest.mark.parametrize("shape", [(7, 7), (4, 9), (9, 4), (1, 5), (1, 1)])
-def test_sparse_affinity_is_the_dense_one(shape, exponent):
+@pytest.mark.parametrize("width", [1e-9, 0.3, 1e9])
+@pytest.mark.parametrize("shape", [(7, 7), (4, 9), (9, 4), (1, 5), (5, 1), (2, 2), (1, 1)])
+def test_affinity_by_windows_is_the_dense_one(shape, width):
     rng = np.random.default_rng(3)
-    kinds = np.vstack([np.eye(3), rng.dirichlet(np.ones(3), 9)])  # some have no class in common
-    source, target = (
-        ObjectGraph.from_positions(rng.uniform(-5, 5, (n, 3)).round(1), attributes=rng.permutation(kinds)[:n])
-        for n in shape
-    )
-    s, t = distances(source.positions), distances(target.positions)
-    A = attribute_similarity(source.attributes, target.attributes) ** exponent
-    dense_one = affinity_matrix(source, target, s, t, 0.3, exponent)
-    start, column, value = distance_affinity(s, t, 0.3, A.ravel(), exponent > 0)
-    found = np.zeros_like(dense_one)
-    for row in range(len(found)):
-        here = slice(start[row], start[row + 1])
-        assert len(set(column[here])) == len(column[here])
-        found[row, column[here]] = value[here]
-    np.testing.assert_allclose(found, dense_one, atol=1e-12)
-    assert len(value) <= (dense_one > 1e-13).sum() + len(found)
+    n, m = shape
+    s, t = (distances(rng.uniform(-5, 5, (k, 3)).round(1)) for k in shape)
+    a, diagonal = rng.uniform(size=(2, n, m))
+    a[rng.uniform(size=(n, m)) < 0.3] = 0.0  # some have no class in common
+    K = pair_affinity(s, t, width).reshape(n * m, n * m) * a.ravel() * a.reshape(-1, 1) + np.diag(diagonal.ravel())
+    x = rng.uniform(size=(n, m))
+    affinity = distance_affinity(s, t, width, a, diagonal)
+    partners = np.full((n, 2, len(affinity.first)), np.nan, dtype=np.float32)
+    np.testing.assert_allclose(multiply(affinity, x, partners).ravel(), K @ x.ravel(), rtol=1e-5)
+
+
+def test_windows_leave_out_what_is_negligible():
+    """Of 1,770 target distances, only those within reach of the one source distance, and what fills their blocks."""
+    s = np.array([[0.0, 500.0], [500.0, 0.0]])
+    t = distances(np.linspace(0, 1000, 60)[:, None] * [1.0, 0, 0])
+    agreeing = (np.abs(t[np.triu_indices(60, 1)] - 500.0) <= np.sqrt(27.6 * 500.0)).sum()
+    weight = np.ones((2, 60))
+    entries = len(distance_affinity(s, t, 500.0, weight, weight).value)
+    assert agreeing <= entries <= agreeing + 2 * BLOCK
+    assert entries < 1770 / 3
 
 
 def test_rrwm_reaches_the_optimum_of_its_affinity_on_small_problems():
