@@ -45,6 +45,7 @@ def test_prefers_more_pairs_inside_the_gate_then_least_distance():
             best = max(best, (len(inside), -sum(inside)))
         total = sum(distance[i, j] for i, j in matching.pairs)
         assert (len(matching), -total) == pytest.approx(best)
+        np.testing.assert_allclose(matching.scores, 1 - distance[tuple(matching.pairs.T)] / 3.0)
 
 
 def test_gate_must_be_positive():

@@ -11,7 +11,7 @@ from covis.matching import ObjectGraph
 from covis.matching import objective as ob
 from covis.matching import objective_state as st
 from covis.matching import rgm_chain as solver
-from covis.matching.rgm import rgm, rgm_no_covisibility, rgm_no_uncertainty
+from covis.matching.rgm import rgm, rgm_no_covisibility, rgm_no_uncertainty, scores
 from covis.matching.rgm_chain import Annealing
 from covis.matching.rgm_problem import Similarity, build
 
@@ -212,6 +212,25 @@ def test_finds_covisible_objects_among_identical_ones(acceptance):
         common += len(truth)
     assert correct / retrieved > 0.9
     assert correct / common > 0.7
+
+
+def test_scores_are_mean_similarities_of_attributes_pairs_and_triples():
+    p = make_problem(np.random.default_rng(5), n=5, m=5)
+    terms, match = p.terms, np.array([2, -1, 0, 1, 4])
+    matches = [(i, int(ii)) for i, ii in enumerate(match) if ii >= 0]
+    found = scores(terms, match)
+    assert found[1] == 0
+    for a in matches:
+        others = [b for b in matches if b != a]
+        triples = [
+            ob.triple_similarity(terms, *a, *b, *c)
+            * terms.angle_weight[a]
+            * terms.angle_weight[b]
+            * terms.angle_weight[c]
+            for b, c in permutations(others, 2)
+        ]
+        parts = [terms.attribute[a], np.mean([terms.pair[(*a, *b)] for b in others]), np.mean(triples)]
+        assert found[a[0]] == pytest.approx(np.mean(parts))
 
 
 def test_same_stream_same_answer():

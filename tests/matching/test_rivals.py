@@ -4,16 +4,19 @@ from itertools import combinations, permutations
 
 import numpy as np
 import pytest
+from scipy.optimize import linear_sum_assignment
 
-from covis.matching import ObjectGraph, bcagm, clipper, icp, mos, rrwhm, rrwm
+from covis.matching import Matching, ObjectGraph, RelativePose, bcagm, clipper, icp, mos, rrwhm, rrwm
 from covis.matching.bcagm import block_ascent, convexity_bound, lifted_gradient
-from covis.matching.candidates import affinity_matrix
+from covis.matching.candidates import affinity_matrix, mean_agreement
 from covis.matching.clipper import consistency, densest_clique
 from covis.matching.icp import _starts, align, rigid, spread_rotations
 from covis.matching.pose import rotation_from_vector
 from covis.matching.random_walk import BLOCK, distance_affinity, multiply, reweighted_random_walk, sinkhorn
 from covis.matching.rrwhm import hypergraph_walk, triples
+from covis.matching.rrwm import distance_width
 from covis.matching.similarity import (
+    attribute_similarity,
     contract,
     distances,
     nearest_triples,
@@ -126,6 +129,34 @@ def test_rrwm_reaches_the_optimum_of_its_affinity_on_small_problems():
     assert hits >= 24
 
 
+def test_width_is_a_multiple_of_the_median_variance_of_a_candidate():
+    rng = np.random.default_rng(1)
+    source, target = (
+        ObjectGraph.from_positions(rng.uniform(-5, 5, (n, 3)), position_variance=rng.uniform(0.1, 1, n)) for n in (3, 5)
+    )
+    s, t = distances(source.positions), distances(target.positions)
+    U = source.position_variance[:, None] + target.position_variance
+    assert distance_width(source, target, s, t, None, 3.0) == pytest.approx(3 * np.median(U))
+    assert distance_width(source, target, s, t, 0.7, 3.0) == 0.7
+
+
+def test_score_is_the_mean_affinity_with_the_other_matches():
+    rng = np.random.default_rng(2)
+    s, t = distances(rng.uniform(-1, 1, (4, 3))), distances(rng.uniform(-1, 1, (5, 3)))
+    A = rng.uniform(size=(4, 5))
+    K = pair_affinity(s, t, 0.5) * A[:, :, None, None] * A
+    pairs = [(0, 3), (1, 1), (3, 0)]
+    found = mean_agreement(Matching(np.array(pairs), np.ones(3)), s, t, 0.5, A)
+    expected = [np.mean([K[i, ii, j, jj] for j, jj in pairs if j != i]) for i, ii in pairs]
+    np.testing.assert_allclose(found.scores, expected)
+
+
+def test_rrwm_weighs_attributes_as_it_is_told():
+    source, moved, truth = misleading_kinds(5)
+    assert as_list(rrwm(source, moved, distance_width_m2=0.1, attribute_weight=0)) == truth
+    assert as_list(rrwm(source, moved, distance_width_m2=1e6, attribute_weight=3)) == [[i, i] for i in range(5)]
+
+
 # Triples
 
 
@@ -143,6 +174,16 @@ def test_nearest_triples_are_those_within_the_radius():
         (i, x), (j, y), (k, z) = divmod(a, 5), divmod(b, 5), divmod(e, 5)
         assert far == pytest.approx(triangle_distance(c, i, j, k, d, x, y, z, False))
         assert far <= radius[i, j, k]
+
+
+@pytest.mark.parametrize("width", [None, 0.4])
+def test_triples_are_weighted_by_their_distance(width):
+    source, target, _ = small(5)
+    c, d = vertex_cosines(source.positions), vertex_cosines(target.positions)
+    index, distance = nearest_triples(c, d, 8, False)
+    found, values = triples(source, target, 0.5, width)
+    assert (found == index).all()
+    np.testing.assert_allclose(values, np.exp(-distance / (distance.mean() if width is None else width)))
 
 
 def test_contract_is_the_tensor_product():
@@ -205,27 +246,86 @@ def test_lifted_form_agrees_with_its_gradient_and_ascent_never_loses_to_its_star
     np.testing.assert_allclose(x @ lifted_gradient(index, values, y, z, t, alpha), form(x), rtol=1e-12)
     best = block_ascent(index, values, 4, 4, 50)
     assert best.reshape(4, 4).sum(axis=0).tolist() == [1, 1, 1, 1]
-    assert convexity_bound(values, 4) > 0
+    start = np.full(16, 0.25)
+    assert best @ contract(index, values, best, best) >= start @ contract(index, values, start, start)
+
+
+@pytest.mark.parametrize("shape", [(4, 4), (3, 6), (6, 3)])
+def test_lifted_form_is_convex_at_the_bound_and_only_there(shape):
+    n, m = shape
+    rng = np.random.default_rng(n)
+    source, target = (ObjectGraph.from_positions(rng.uniform(-5, 5, (k, 3))) for k in shape)
+    index, values = triples(source, target, 1.0, None)
+
+    def least_curvature(x, alpha):
+        unit = np.eye(n * m)
+        hessian = np.array([lifted_gradient(index, values, x, x, e, alpha) for e in unit])
+        return np.linalg.eigvalsh(hessian).min()
+
+    bound = convexity_bound(values, min(n, m))
+    for x in rng.uniform(size=(20, n * m)):
+        assert least_curvature(x, bound) >= 0 > least_curvature(x, 0.0)
+
+
+def test_bcagm_scores_are_parts_of_the_third_order_score():
+    source, target, _ = small(6)
+    found = bcagm(source, target, neighbours_factor=1.0)
+    T = dense(*triples(source, target, 1.0, 0.3), 16)
+    x = indicator(found.pairs[np.argsort(found.pairs[:, 0]), 1], 4)
+    part = np.einsum("abc,b,c->a", T, x, x).reshape(4, 4)[tuple(found.pairs.T)]
+    np.testing.assert_allclose(found.scores, part / part.max())
 
 
 # MOS
 
 
-def test_mos_uses_every_order():
+def misleading_kinds(n):
+    """Graphs of n objects, one moved and in another order, with kinds that say otherwise, and the true matches."""
     rng = np.random.default_rng(5)
-    p = rng.uniform(-5, 5, (5, 3))
-    kinds = np.eye(5)
-    source = ObjectGraph.from_positions(p, attributes=kinds)
-    # Attributes alone: positions say nothing.
-    other = ObjectGraph.from_positions(rng.uniform(-5, 5, (5, 3)), attributes=kinds[::-1].copy())
-    assert as_list(mos(source, other, order_weights=(1, 0, 0))) == [[i, 4 - i] for i in range(5)]
-    # Geometry alone: attributes mislead.
-    moved = ObjectGraph.from_positions(p[[2, 0, 4, 1, 3]] + 1.0, attributes=kinds)
-    truth = [[0, 1], [1, 3], [2, 0], [3, 4], [4, 2]]
+    p, order = rng.uniform(-5, 5, (n, 3)), rng.permutation(n)
+    kinds = 0.9 * np.eye(n) + 0.1 / n
+    source, moved = (ObjectGraph.from_positions(x, attributes=kinds) for x in (p, p[order] + 1.0))
+    return source, moved, sorted([int(i), k] for k, i in enumerate(order))
+
+
+def test_mos_uses_every_order():
+    source, moved, truth = misleading_kinds(5)
+    assert truth != [[i, i] for i in range(5)]
+    assert as_list(mos(source, moved, order_weights=(1, 0, 0))) == [[i, i] for i in range(5)]
     assert as_list(mos(source, moved, order_weights=(0, 1, 0), distance_width_m2=0.1)) == truth
     assert as_list(mos(source, moved, order_weights=(0, 0, 1), angle_width=0.1)) == truth
     with pytest.raises(ValueError, match="order_weights must be three"):
         mos(source, moved, order_weights=(0, 0, 0))
+
+
+def test_mos_is_the_published_walk_over_three_orders_in_numpy():
+    rng = np.random.default_rng(9)
+    source, target = (
+        ObjectGraph.from_positions(rng.uniform(-5, 5, (n, 3)), attributes=rng.dirichlet(np.ones(3), n)) for n in (4, 4)
+    )
+    weights, u = (0.7, 1.3, 0.4), np.full(16, 1 / 16)
+    first = (attribute_similarity(source.attributes, target.attributes) ** 2).ravel()
+    second = pair_affinity(distances(source.positions), distances(target.positions), 3.0).reshape(16, 16)
+    third = dense(*triples(source, target, 0.8, 0.5), 16)
+    first *= weights[0] / first.max()
+    second *= weights[1] / (second @ u).max()
+    third *= weights[2] / np.einsum("abc,b,c->a", third, u, u).max()
+    x = u
+    for _ in range(6):
+        walk = first * x.sum() ** 2 + second @ x * x.sum() + np.einsum("abc,b,c->a", third, x, x)
+        walk /= walk.sum()
+        jump = np.exp(30.0 * walk / walk.max()).reshape(4, 4)
+        for _ in range(9):
+            jump /= jump.sum(axis=1, keepdims=True)
+            jump /= jump.sum(axis=0, keepdims=True)
+        x = 0.2 * walk + 0.8 * jump.ravel() / jump.sum()
+    found = mos(
+        source, target, order_weights=weights, attribute_exponent=2.0, distance_width_m2=3.0, angle_width=0.5,
+        neighbours_factor=0.8, iterations=6, sinkhorn_iterations=9, tolerance=0.0, sinkhorn_tolerance=0.0,
+    )  # fmt: skip
+    rows, cols = linear_sum_assignment(x.reshape(4, 4), maximize=True)
+    assert as_list(found) == np.stack([rows, cols], axis=1).tolist()
+    np.testing.assert_allclose(found.scores, x.reshape(4, 4)[tuple(found.pairs.T)] / x.max(), rtol=1e-9)
 
 
 def test_mos_reaches_the_optimum_of_its_three_orders_on_small_problems():
@@ -357,6 +457,30 @@ def test_clipper_returns_a_clique():
     assert np.abs(difference).max() < 0.3
 
 
+def test_clipper_scores_are_mean_consistencies_under_widths_from_the_variances():
+    rng = np.random.default_rng(4)
+    p = rng.uniform(-5, 5, (6, 3))
+    source = ObjectGraph.from_positions(p, position_variance=0.03)
+    target = ObjectGraph.from_positions(p + rng.normal(0, 0.1, p.shape), position_variance=0.05)
+    found = clipper(source, target, sigma_factor=2.0, epsilon_sigmas=4.0)
+    sigma = 2 * np.sqrt(0.08)
+    s, t = (distances(g.positions[k]) for g, k in zip((source, target), found.pairs.T, strict=True))
+    agreement = np.exp(-0.5 * (s - t) ** 2 / sigma**2)
+    assert len(found) >= 4
+    assert np.abs(s - t).max() < 4 * sigma
+    np.testing.assert_allclose(found.scores, (agreement.sum(axis=1) - 1) / (len(found) - 1))
+
+
+def test_clipper_leaves_out_candidates_of_other_kinds():
+    p = np.random.default_rng(5).uniform(-5, 5, (6, 3))
+    kinds = np.tile([[1.0, 0.0], [0.0, 1.0]], (3, 1))
+    other = kinds.copy()
+    other[:2] = other[1::-1]  # the first two seem to have changed places
+    source, target = (ObjectGraph.from_positions(p, attributes=k) for k in (kinds, other))
+    assert as_list(clipper(source, target, min_similarity=0.5)) == [[i, i] for i in range(2, 6)]
+    assert as_list(clipper(source, target, min_similarity=0.0)) == [[i, i] for i in range(6)]
+
+
 # ICP
 
 
@@ -406,6 +530,57 @@ def test_icp_finds_the_alignment_of_least_error_on_small_problems():
         R, t = align(p, q, *_starts(source, target, None, 60, "objects"), 50, 1e-6, 20.0, np.inf, 0.0)
         reached += error(R, t) <= best + 1e-6
     assert reached >= 18
+
+
+def align_in_numpy(p, q, R, t, iterations, first_gate, final_gate, shrink):
+    """Besl and McKay's loop from every start: closest points, then the rigid motion of those within the gate."""
+    best, gate = (np.inf, None, None), 0.0
+    for R_0, t_0 in zip(R, t, strict=True):
+        now, gate = (R_0, t_0), first_gate
+        for _ in range(iterations):
+            distance = np.linalg.norm(p[:, None] - (q @ now[0].T + now[1])[None], axis=2)
+            squared = distance.min(axis=0) ** 2
+            error = np.minimum(squared, final_gate**2).mean()
+            if error < best[0] * (1 - 1e-12):
+                best = (error, *now)
+            gate = max(final_gate, shrink * gate)
+            pulled = squared <= gate**2
+            if pulled.sum() < 2:
+                break
+            now = rigid(p[distance.argmin(axis=0)[pulled]], q[pulled])
+    return best[1:]
+
+
+@pytest.mark.parametrize("gates", [(np.inf, np.inf, 0.0), (0.8, 0.8, 0.0), (6.0, 0.8, 0.7)])
+def test_icp_is_the_published_iteration_in_numpy(gates):
+    rng = np.random.default_rng(3)
+    p = rng.uniform(-5, 5, (7, 3))
+    q = np.r_[p[:5] @ rotation_from_vector(np.array([0.3, -1.0, 0.8])).T, rng.uniform(-5, 5, (2, 3))]
+    starts = _starts(*(ObjectGraph.from_positions(x) for x in (p, q)), None, 10, "objects")
+    R, t = align(p, q, *starts, 12, 0.0, *gates)
+    R_expected, t_expected = align_in_numpy(p, q, *starts, 12, *gates)
+    np.testing.assert_allclose(R, R_expected, atol=1e-9)
+    np.testing.assert_allclose(t, t_expected, atol=1e-9)
+
+
+def test_icp_turns_about_gravity_where_it_is_known():
+    up = rotation_from_vector(np.array([0.2, -0.1, 0.0])) @ [0.0, 0, 1]
+    source = ObjectGraph.from_positions(np.zeros((1, 3)), up=[0, 0, 1])
+    target = ObjectGraph.from_positions(np.zeros((1, 3)), up=up)
+    R, _ = _starts(source, target, None, 8, "centroids")
+    np.testing.assert_allclose(R @ up, np.tile([0.0, 0, 1], (8, 1)), atol=1e-9)
+    turn = (R @ R[0].T)[:, :2, 0]
+    np.testing.assert_allclose(np.unwrap(np.arctan2(*turn.T[::-1])), np.arange(8) * np.pi / 4, atol=1e-9)
+
+
+def test_icp_matches_each_others_closest_within_the_gate_scored_by_distance():
+    p = np.array([[0.0, 0, 0], [5, 0, 0], [0, 5, 0], [0, 0, 5], [9, 9, 9]])
+    q = p + np.array([[0.0, 0, 0.1], [0, 0, 0], [0, 0, -0.1], [0, 0, 0], [3, 0, 0]])
+    source, target = (ObjectGraph.from_positions(x) for x in (p, q))
+    prior = RelativePose(np.eye(4), np.eye(6))
+    found = icp(source, target, prior=prior, iterations=1, gate_m=0.4)
+    assert as_list(found) == [[i, i] for i in range(4)]
+    np.testing.assert_allclose(found.scores, [0.75, 1, 0.75, 1])
 
 
 def test_icp_starts_from_the_prior_if_there_is_one():
