@@ -108,9 +108,13 @@ def is_consistent(matchings: Mapping[Pair, Matching], sizes: Sequence[int]) -> b
 def _check(matchings: Mapping[Pair, Matching], sizes: Sequence[int], match_prior: float) -> None:
     if not 0.0 < match_prior < 1.0:
         raise ValueError(f"match_prior must lie in (0, 1), got {match_prior}")
-    for (i, j), matching in matchings.items():
-        if i == j or not (0 <= i < len(sizes) and 0 <= j < len(sizes)):
-            raise ValueError(f"pair ({i}, {j}) does not name two of {len(sizes)} robots")
+    for pair, matching in matchings.items():
+        robots = range(len(sizes))
+        if not (isinstance(pair, tuple) and len(set(pair)) == len(pair) == 2 and all(i in robots for i in pair)):
+            raise ValueError(f"pair {pair!r} does not name two of {len(sizes)} robots by their numbers, from 0")
+        if not isinstance(matching, Matching):
+            raise TypeError(f"matchings[{pair}] must be a Matching, got {type(matching).__name__}")
+        i, j = pair
         if len(matching) and (matching.pairs.max(axis=0) >= (sizes[i], sizes[j])).any():
             raise ValueError(f"matching ({i}, {j}) speaks of a detection beyond {sizes[i]} and {sizes[j]}")
 

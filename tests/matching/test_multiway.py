@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from itertools import combinations
 
 import numpy as np
@@ -150,8 +151,11 @@ def test_degenerate(method):
 
 
 def test_bad_input_raises():
-    with pytest.raises(ValueError, match="two of 2 robots"):
-        groups({(0, 2): Matching.empty()}, [1, 1])
+    for pair in ((0, 2), (1, 1), (-1, 0), ("a", "b"), (0, 1, 2), 0):
+        with pytest.raises(ValueError, match=f"pair {re.escape(repr(pair))} does not name two of 2 robots"):
+            groups({pair: Matching.empty()}, [1, 1])  # type: ignore[dict-item]
+    with pytest.raises(TypeError, match=r"matchings\[\(0, 1\)\] must be a Matching, got list"):
+        consistent({(0, 1): [(0, 0)]}, [1, 1])  # type: ignore[dict-item]
     with pytest.raises(ValueError, match="beyond"):
         groups({(0, 1): Matching(np.array([[0, 1]]), [0.5])}, [1, 1])
     with pytest.raises(ValueError, match="method"):
