@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from importlib import import_module
 from typing import Any
@@ -16,10 +16,10 @@ from .collaborative import CollaborativeEnv
 from .scoring import LocalizationReward
 from .sensing import PoseNoise
 from .worlds import aerial_ground, driving_params, multi_robot, target_localization
-from .worlds.aerial_ground import AerialGroundWorld
-from .worlds.driving import ConnectedDrivingWorld
-from .worlds.multi_robot import MultiRobotWorld
-from .worlds.target_localization import TargetLocalizationWorld
+from .worlds.aerial_ground import AerialGroundParams, AerialGroundWorld
+from .worlds.driving import ConnectedDrivingWorld, DrivingParams
+from .worlds.multi_robot import MultiRobotParams, MultiRobotWorld
+from .worlds.target_localization import TargetLocalizationParams, TargetLocalizationWorld
 from .worlds.world import World
 
 
@@ -29,7 +29,8 @@ class Scene:
 
     Attributes:
         world: called with (n_robots, params).
-    preset: name of a difficulty -> params of the world.
+        params: the type of `params`, a dataclass; without arguments the generator's own defaults.
+        preset: name of a difficulty, and changes of it by name -> params.
         n_robots: default number of robots with cameras.
         pose_noise: errors of the robots' reported poses.
         reward: the team's default reward.
@@ -38,7 +39,8 @@ class Scene:
     """
 
     world: Callable[..., World]
-    preset: Callable[[str], Any]
+    params: type[Any]
+    preset: Callable[..., Any]
     n_robots: int
     pose_noise: PoseNoise
     reward: LocalizationReward
@@ -51,14 +53,37 @@ REAL_CAMERAS = EffectRanges(k1=(0.0, 0.0), k2=(0.0, 0.0))
 
 SCENES: dict[str, Scene] = {
     "connected_driving": Scene(
-        ConnectedDrivingWorld, driving_params.preset, 2, PoseNoise(1.0, 0.0175), LocalizationReward(cap_m=5.0)
+        ConnectedDrivingWorld,
+        DrivingParams,
+        driving_params.preset,
+        2,
+        PoseNoise(1.0, 0.0175),
+        LocalizationReward(cap_m=5.0),
     ),
-    "multi_robot": Scene(MultiRobotWorld, multi_robot.preset, 2, PoseNoise(0.3, 0.02), LocalizationReward(cap_m=2.0)),
+    "multi_robot": Scene(
+        MultiRobotWorld,
+        MultiRobotParams,
+        multi_robot.preset,
+        2,
+        PoseNoise(0.3, 0.02),
+        LocalizationReward(cap_m=2.0),
+    ),
     "aerial_ground": Scene(
-        AerialGroundWorld, aerial_ground.preset, 2, PoseNoise(0.2, 0.02), LocalizationReward(cap_m=2.0), REAL_CAMERAS
+        AerialGroundWorld,
+        AerialGroundParams,
+        aerial_ground.preset,
+        2,
+        PoseNoise(0.2, 0.02),
+        LocalizationReward(cap_m=2.0),
+        REAL_CAMERAS,
     ),
     "target_localization": Scene(
-        TargetLocalizationWorld, target_localization.preset, 2, PoseNoise(0.02, 0.01), LocalizationReward(cap_m=0.5)
+        TargetLocalizationWorld,
+        TargetLocalizationParams,
+        target_localization.preset,
+        2,
+        PoseNoise(0.02, 0.01),
+        LocalizationReward(cap_m=0.5),
     ),
 }
 
@@ -73,10 +98,12 @@ def parallel_env(
         n_robots: robots with cameras; None = the scene's default.
         preset: difficulty, `easy`, `paper` or `hard`; None = the generator's own defaults. The benchmark takes `paper`.
         params: of the world's generator, instead of a preset.
-        options: of `CollaborativeEnv`.
+        options: of `CollaborativeEnv`; or parameters of the generator by name, such as `map` or `dynamics`, instead of
+            those of the preset or of `params`.
 
     Raises:
         ValueError: an unknown scene, or what the world or the environment refuses.
+        TypeError: an option that neither has.
     """
     if scene not in SCENES and ":" in scene:
         return _own_scene(scene, n_robots, preset, params, options)
@@ -85,7 +112,11 @@ def parallel_env(
     spec = SCENES[scene]
     if params is not None and preset is not None:
         raise ValueError(f"give a preset or params, not both: preset={preset!r}")
-    params = spec.preset(preset) if preset is not None else params
+    changes = {field.name: options.pop(field.name) for field in fields(spec.params) if field.name in options}
+    if preset is not None:
+        params = spec.preset(preset, **changes)
+    elif changes:
+        params = replace(spec.params() if params is None else params, **changes)
     make_world = partial(spec.world, spec.n_robots if n_robots is None else n_robots, params)
     defaults: dict[str, Any] = {
         "name": f"{scene}_v{spec.version}",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -194,8 +195,8 @@ PRESETS = {
 }
 
 
-def preset(name: str) -> AerialGroundParams:
-    """The parameters called `name`: easy, paper or hard. Raises ValueError for another name."""
+def preset(name: str, **changes: Any) -> AerialGroundParams:
+    """The parameters called `name` (easy, paper or hard), some of them changed. Raises ValueError for another name."""
     if name not in PRESETS:
         raise ValueError(f"unknown preset {name!r}; aerial_ground has {', '.join(PRESETS)}")
-    return dataclasses.replace(PRESETS[name])
+    return dataclasses.replace(PRESETS[name], **changes)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -208,8 +209,8 @@ MAP_COUNTS: dict[str, dict[str, float]] = {
 """Roads with one pavement get less street and more traffic, for as many objects a view; not applied by `easy`."""
 
 
-def preset(name: str, map: str = "intersection") -> DrivingParams:
-    """The parameters called `name` (easy, paper or hard) on a map.
+def preset(name: str, map: str = "intersection", **changes: Any) -> DrivingParams:
+    """The parameters called `name` (easy, paper or hard) on a map, some of them changed.
 
     Raises:
         ValueError: no such preset or map.
@@ -217,4 +218,4 @@ def preset(name: str, map: str = "intersection") -> DrivingParams:
     if name not in PRESETS:
         raise ValueError(f"unknown preset {name!r}; connected_driving has {', '.join(PRESETS)}")
     counts = {} if name == "easy" else MAP_COUNTS.get(map, {})
-    return DrivingParams(map=map, **{**PRESETS[name], **counts})  # type: ignore[arg-type]
+    return DrivingParams(map=map, **{**PRESETS[name], **counts, **changes})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
 from .robot_params import RobotSceneParams
 from .robots import RobotWorld
@@ -45,8 +46,8 @@ PRESETS = {
 }
 
 
-def preset(name: str) -> MultiRobotParams:
-    """The parameters called `name`: easy, paper or hard. Raises ValueError for another name."""
+def preset(name: str, **changes: Any) -> MultiRobotParams:
+    """The parameters called `name` (easy, paper or hard), some of them changed. Raises ValueError for another name."""
     if name not in PRESETS:
         raise ValueError(f"unknown preset {name!r}; multi_robot has {', '.join(PRESETS)}")
-    return dataclasses.replace(PRESETS[name])
+    return dataclasses.replace(PRESETS[name], **changes)

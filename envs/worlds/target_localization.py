@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
 from .robot_params import Range, RobotSceneParams
 from .robots import RobotWorld
@@ -68,8 +69,8 @@ PRESETS = {
 }
 
 
-def preset(name: str) -> TargetLocalizationParams:
-    """The parameters called `name`: easy, paper or hard. Raises ValueError for another name."""
+def preset(name: str, **changes: Any) -> TargetLocalizationParams:
+    """The parameters called `name` (easy, paper or hard), some of them changed. Raises ValueError for another name."""
     if name not in PRESETS:
         raise ValueError(f"unknown preset {name!r}; target_localization has {', '.join(PRESETS)}")
-    return dataclasses.replace(PRESETS[name])
+    return dataclasses.replace(PRESETS[name], **changes)

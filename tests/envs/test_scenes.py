@@ -1,9 +1,12 @@
 """Scenes by name, by path, and in PettingZoo's registry."""
 
+from dataclasses import fields, replace
+from inspect import signature
 from pathlib import Path
 
 import pytest
 
+from covis.envs.collaborative import CollaborativeEnv
 from covis.envs.scenes import SCENES, parallel_env
 
 
@@ -21,6 +24,26 @@ def test_preset_or_params():
     params = SCENES["multi_robot"].preset("easy")
     with pytest.raises(ValueError, match="a preset or params, not both"):
         parallel_env("multi_robot", preset="easy", params=params)
+
+
+def test_parameters_of_the_generator_by_name():
+    env = parallel_env("connected_driving", preset="paper", map="highway", n_pedestrians=3)
+    assert env.world.params == SCENES["connected_driving"].preset("paper", "highway", n_pedestrians=3)
+    assert env.world.params.n_vehicles == SCENES["connected_driving"].preset("paper", "highway").n_vehicles
+    params = SCENES["multi_robot"].preset("easy", n_team=3)
+    assert parallel_env("multi_robot", params=params, dynamics="wheels").world.params == replace(
+        params, dynamics="wheels"
+    )
+    with pytest.raises(ValueError, match=r"map must be one of .*, got 'moon'"):
+        parallel_env("connected_driving", map="moon")
+    with pytest.raises(TypeError, match="'gravity'"):
+        parallel_env("multi_robot", gravity=1.6)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_no_parameter_is_called_like_an_option_of_the_environment(scene):
+    options = set(signature(CollaborativeEnv.__init__).parameters)
+    assert not options & {field.name for field in fields(SCENES[scene].params)}
 
 
 def test_a_scene_of_ones_own_by_path():
