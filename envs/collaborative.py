@@ -29,7 +29,7 @@ from .observations import SENSORS, Observer, state_size, state_vector
 from .scoring import LocalizationReward, Reward, StepScore, Truth, score, tight_boxes
 from .seeding import EpisodeSeeds, Seed
 from .sensing import PoseNoise
-from .worlds.world import Snapshot, World
+from .worlds.world import Snapshot, World, checked_world
 
 
 @dataclass(eq=False)
@@ -99,7 +99,7 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
 
     Raises:
         ValueError: a size, sensor or mode that does not exist; a world with a single robot; mounts for other robots.
-        TypeError: pose noise, a reward, a look, effects or a mount that is something else.
+        TypeError: pose noise, a reward, a look, effects, a mount or a world that is something else.
     """
 
     def __init__(
@@ -168,7 +168,7 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
             raise ValueError(f"unknown sensor {unknown[0]!r}; there are {', '.join(SENSORS)}")
         if render_mode not in (None, "rgb_array", "human"):
             raise ValueError(f"render_mode must be 'rgb_array', 'human' or None, got {render_mode!r}")
-        self.world = make_world()
+        self.world = checked_world(make_world())
         self.metadata = {
             "name": name,
             "render_modes": ["rgb_array", "human"],

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from .checks import Range, require
 from .layout import in_disc
-from .robot_params import Range, RobotSceneParams, require
+from .robot_params import RobotSceneParams
 from .robots import RobotWorld, Scene, State, camera_mount, planar_poses
 from .world import Array
 
@@ -81,9 +82,9 @@ class AerialGroundWorld(RobotWorld):
     n_flyers = 1
     params: AerialGroundParams
 
-    def __init__(self, n_observers: int = 2, params: AerialGroundParams | None = None) -> None:
+    def __init__(self, n_robots: int = 2, params: AerialGroundParams | None = None) -> None:
         """Raises ValueError for a number of observers that does not fit."""
-        super().__init__(n_observers, params or AerialGroundParams())
+        super().__init__(n_robots, params or AerialGroundParams())
         self.horizontal_fov_rad[0] = math.radians(self.params.drone_fov_deg)
 
     def _place_flyers(self, rng: np.random.Generator) -> Array:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from .checks import check_fields, check_names, require
 from .driving_maps import MAPS
-from .lighting import check_times
+from .lighting import TIMES_OF_DAY
 from .world import ObjectClass
 
 Size = tuple[float, float, float]
@@ -117,28 +117,19 @@ class DrivingParams:
     max_steering_rad: float = 0.6
 
     def __post_init__(self) -> None:
-        if self.map not in MAPS:
-            raise ValueError(f"map must be one of {', '.join(sorted(MAPS))}, got {self.map!r}")
-        counts = [f.name for f in dataclasses.fields(self) if f.name.startswith("n_")]
-        for name in (*counts, "max_vehicles"):
-            value = getattr(self, name)
-            if not isinstance(value, (int, np.integer)) or value < 0:
-                raise ValueError(f"{name} must be a whole number, not negative, got {value!r}")
+        """Raise ValueError naming the first impossible value."""
+        check_fields(self)
+        require(isinstance(self.map, str) and self.map in MAPS, "map", self.map, f"one of {', '.join(sorted(MAPS))}")
         if self.n_vehicles > self.max_vehicles:
             raise ValueError(f"n_vehicles {self.n_vehicles} exceeds max_vehicles {self.max_vehicles}")
         for name in ("spawn_probability", "look_alike_fraction", "crossing_share", "same_approach_share"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)}")
-        if not 0 <= self.prewarm_s <= 60:
-            raise ValueError(f"prewarm_s must be in [0, 60], got {self.prewarm_s}")
-        if not 0 < self.horizontal_fov_rad < np.pi:
-            raise ValueError(f"horizontal_fov_rad must be in (0, pi), got {self.horizontal_fov_rad}")
-        if not 0 < self.max_steering_rad < np.pi / 2:
-            raise ValueError(f"max_steering_rad must be in (0, pi / 2), got {self.max_steering_rad}")
+            require(0 <= getattr(self, name) <= 1, name, getattr(self, name), "in [0, 1]")
+        require(0 <= self.prewarm_s <= 60, "prewarm_s", self.prewarm_s, "in [0, 60]")
+        require(0 < self.horizontal_fov_rad < np.pi, "horizontal_fov_rad", self.horizontal_fov_rad, "in (0, pi)")
+        require(0 < self.max_steering_rad < np.pi / 2, "max_steering_rad", self.max_steering_rad, "in (0, pi / 2)")
         for name in ("camera_height_m", "max_acceleration", "street_spread_m"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        check_times(self.times_of_day)
+            require(getattr(self, name) > 0, name, getattr(self, name), "positive")
+        check_names("times_of_day", self.times_of_day, TIMES_OF_DAY)
 
     @property
     def max_objects(self) -> int:

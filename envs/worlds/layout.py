@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
@@ -97,13 +97,6 @@ LAYOUTS: dict[str, Callable[[np.random.Generator, float, int], Draw]] = {
     "rows": _rows,
     "ring": _ring,
 }
-
-
-def check_layouts(layouts: Sequence[str]) -> None:
-    """Raise ValueError unless `layouts` is a non-empty sequence of names of `LAYOUTS`."""
-    unknown = [name for name in layouts if name not in LAYOUTS]
-    if unknown or not layouts:
-        raise ValueError(f"layouts must name some of {', '.join(LAYOUTS)}, got {tuple(layouts)!r}")
 
 
 def observers_around(

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from .checks import check_names
 from .world import Light
 
 Color = tuple[int, int, int]
@@ -25,7 +26,7 @@ GROUNDS: tuple[Color, ...] = ((122, 124, 120), (138, 130, 112), (104, 116, 90), 
 
 def sample_light(rng: np.random.Generator, times: Sequence[str], grounds: Sequence[Color] = GROUNDS) -> Light:
     """A light of one of the `times`, names of `TIMES_OF_DAY` (else ValueError), the sun anywhere around."""
-    check_times(times)
+    check_names("times_of_day", times, TIMES_OF_DAY)
     elevation_deg, ambient, sky, horizon = TIMES_OF_DAY[times[int(rng.integers(len(times)))]]
     elevation = math.radians(rng.uniform(*elevation_deg))
     azimuth = rng.uniform(-math.pi, math.pi)
@@ -37,13 +38,6 @@ def sample_light(rng: np.random.Generator, times: Sequence[str], grounds: Sequen
         horizon_color=_varied(rng, horizon),
         ground_color=_varied(rng, grounds[int(rng.integers(len(grounds)))]),
     )
-
-
-def check_times(times: Sequence[str]) -> None:
-    """Raise ValueError unless `times` is a non-empty sequence of names of `TIMES_OF_DAY`."""
-    unknown = [name for name in times if name not in TIMES_OF_DAY]
-    if unknown or not times:
-        raise ValueError(f"times_of_day must name some of {', '.join(TIMES_OF_DAY)}, got {tuple(times)!r}")
 
 
 def _varied(rng: np.random.Generator, color: Color, spread: int = 10) -> Color:

@@ -18,9 +18,9 @@ class MultiRobotParams(RobotSceneParams):
 class MultiRobotWorld(RobotWorld):
     """N observers among a team of robots of identical look; obstacles are scenery that hides some of them."""
 
-    def __init__(self, n_observers: int = 2, params: MultiRobotParams | None = None) -> None:
+    def __init__(self, n_robots: int = 2, params: MultiRobotParams | None = None) -> None:
         """Raises ValueError for a number of observers that does not fit."""
-        super().__init__(n_observers, params or MultiRobotParams())
+        super().__init__(n_robots, params or MultiRobotParams())
 
 
 PRESETS = {

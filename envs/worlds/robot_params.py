@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
 
-import numpy as np
-
-from .layout import check_layouts
-from .lighting import check_times
-
-Range = tuple[float, float]
+from .checks import Range, check_fields, check_names, require
+from .layout import LAYOUTS
+from .lighting import TIMES_OF_DAY
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,8 +73,7 @@ class RobotSceneParams:
 
     def __post_init__(self) -> None:
         """Raise ValueError naming the first impossible value."""
-        for field in dataclasses.fields(self):
-            _check_field(field.name, str(field.type), getattr(self, field.name))
+        check_fields(self)
         for name in ("scale", "separation_m", "max_speed_mps", "max_turn_radps", "step_seconds"):
             require(getattr(self, name) > 0, name, getattr(self, name), "positive")
         for name in ("moving_share", "unique_share"):
@@ -93,9 +88,10 @@ class RobotSceneParams:
         require(self.backdrop in ("yard", "lab"), "backdrop", self.backdrop, '"yard" or "lab"')
         require(self.dynamics in ("box", "wheels"), "dynamics", self.dynamics, '"box" or "wheels"')
         require(self.meshes in ("low", "stock"), "meshes", self.meshes, '"low" or "stock"')
-        require(self.mesh_detail_m >= 0, "mesh_detail_m", self.mesh_detail_m, "at least 0")
-        check_layouts(self.layouts)
-        check_times(self.times_of_day)
+        for name in ("mesh_detail_m", "obstacle_distance_m"):
+            require(getattr(self, name) >= 0, name, getattr(self, name), "at least 0")
+        check_names("layouts", self.layouts, LAYOUTS)
+        check_names("times_of_day", self.times_of_day, TIMES_OF_DAY)
         footprint = math.pi * (0.5 * self.separation_m) ** 2
         room = math.pi * (self.team_radius_m[1] + 0.5 * self.separation_m) ** 2
         require(
@@ -104,31 +100,3 @@ class RobotSceneParams:
             self.n_team,
             "few enough for team_radius_m and separation_m",
         )
-
-
-def require(ok: bool, name: str, value: object, wanted: str) -> None:
-    """Raise ValueError naming a parameter, what it must be and what it is, unless `ok`."""
-    if not ok:
-        raise ValueError(f"{name} must be {wanted}, got {value!r}")
-
-
-def _check_field(name: str, kind: str, value: object) -> None:
-    """Raise ValueError unless the value is of its field's kind: whole, finite, a pair (low, high)."""
-    if kind == "int":
-        require(_whole(value), name, value, "a whole number, not negative")
-    elif kind == "float":
-        require(_finite(value), name, value, "a finite number")
-    elif kind in ("Range", "tuple[int, int]"):
-        number, what = (_whole, "whole numbers") if kind != "Range" else (_finite, "finite numbers")
-        pair = isinstance(value, tuple) and len(value) == 2 and all(map(number, value)) and value[0] <= value[1]
-        require(pair, name, value, f"a pair (low, high) of {what} with low <= high")
-        if isinstance(value, tuple) and not name.endswith("_deg"):
-            require(value[0] >= 0, name, value, "a pair of non-negative numbers")
-
-
-def _finite(value: object) -> bool:
-    return isinstance(value, int | float | np.number) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _whole(value: object) -> bool:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(value >= 0)

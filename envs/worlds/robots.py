@@ -96,12 +96,12 @@ class RobotWorld:
     n_flyers = 0
     """Observers that fly: the first ones."""
 
-    def __init__(self, n_observers: int, params: RobotSceneParams) -> None:
+    def __init__(self, n_robots: int, params: RobotSceneParams) -> None:
         """Raises ValueError for a number of observers that does not fit, TypeError for parameters of something else."""
         if not isinstance(params, RobotSceneParams):
             raise TypeError(f"params must be those of a robot scene, got {type(params).__name__}")
         self.params = params
-        self.n_robots = _checked_observers(n_observers, params)
+        self.n_robots = _checked_observers(n_robots, params)
         self.models: tuple[Model, ...] = models(
             params.scale, params.mesh_detail_m if params.meshes == "stock" else None
         )
@@ -451,15 +451,15 @@ def check_controls(controls: Array, n: int, d: int) -> Array:
     return checked
 
 
-def _checked_observers(n_observers: int, params: RobotSceneParams) -> int:
-    if isinstance(n_observers, bool) or not isinstance(n_observers, int | np.integer):
-        raise ValueError(f"n_observers must be an integer, got {n_observers!r}")
-    if not 2 <= n_observers <= MAX_OBSERVERS:
-        raise ValueError(f"n_observers must be between 2 and {MAX_OBSERVERS}, got {n_observers}")
+def _checked_observers(n_robots: int, params: RobotSceneParams) -> int:
+    if isinstance(n_robots, bool) or not isinstance(n_robots, int | np.integer):
+        raise ValueError(f"n_robots must be a whole number, got {n_robots!r}")
+    if not 2 <= n_robots <= MAX_OBSERVERS:
+        raise ValueError(f"n_robots must be between 2 and {MAX_OBSERVERS}, got {n_robots}")
     around = 2 * math.pi * params.observer_distance_m[1]
-    if n_observers * params.separation_m > around:
+    if n_robots * params.separation_m > around:
         raise ValueError(
-            f"n_observers = {n_observers} do not fit on a circle of {params.observer_distance_m[1]} m with "
+            f"n_robots = {n_robots} observers do not fit on a circle of {params.observer_distance_m[1]} m with "
             f"separation_m = {params.separation_m}"
         )
-    return int(n_observers)
+    return int(n_robots)

@@ -6,7 +6,8 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
-from .robot_params import Range, RobotSceneParams
+from .checks import Range
+from .robot_params import RobotSceneParams
 from .robots import RobotWorld
 
 SCALE = 0.36
@@ -42,9 +43,9 @@ class TargetLocalizationParams(RobotSceneParams):
 class TargetLocalizationWorld(RobotWorld):
     """Observers and targets drive, obstacles stand; all may look the same and all are objects."""
 
-    def __init__(self, n_observers: int = 2, params: TargetLocalizationParams | None = None) -> None:
+    def __init__(self, n_robots: int = 2, params: TargetLocalizationParams | None = None) -> None:
         """Raises ValueError for a number of observers that does not fit."""
-        super().__init__(n_observers, params or TargetLocalizationParams())
+        super().__init__(n_robots, params or TargetLocalizationParams())
 
 
 PRESETS = {

@@ -9,7 +9,7 @@ World frame: z up, metres. Camera frame: x right, y down, z forward. Angles: rad
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -160,6 +160,14 @@ class World(Protocol):
 
     def close(self) -> None:
         """Release the simulator; calling it twice is harmless."""
+
+
+def checked_world(world: Any) -> World:
+    """The world. Raises TypeError naming what it lacks of the protocol."""
+    missing = [name for name in vars(World) if not name.startswith("_") and not hasattr(world, name)]
+    if missing:
+        raise TypeError(f"{type(world).__name__} is no World: it has no {', '.join(missing)}")
+    return cast(World, world)
 
 
 class SceneGenerationError(RuntimeError):

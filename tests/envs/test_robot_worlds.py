@@ -296,7 +296,7 @@ def test_observers_up_to_eight_have_different_views() -> None:
 
 @pytest.mark.parametrize("bad", [0, 1, 9, -3, 2.5, "two", True])
 def test_impossible_numbers_of_observers(bad: object) -> None:
-    with pytest.raises(ValueError, match=f"n_observers.*{bad}"):
+    with pytest.raises(ValueError, match=f"n_robots.*{bad}"):
         MultiRobotWorld(bad)  # type: ignore[arg-type]
 
 
@@ -334,7 +334,7 @@ def test_impossible_parameters_are_named(changes: dict[str, object], named: str)
 
 def test_more_observers_than_fit() -> None:
     params = dataclasses.replace(SMALL, observer_distance_m=(1.0, 1.5), separation_m=2.0)
-    with pytest.raises(ValueError, match=r"n_observers = 8.*1.5"):
+    with pytest.raises(ValueError, match=r"n_robots = 8.*1.5"):
         MultiRobotWorld(8, params)
 
 

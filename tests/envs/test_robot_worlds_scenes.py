@@ -470,5 +470,5 @@ def test_bad_parameters_of_the_new_scenes_are_named() -> None:
         AerialGroundParams(drone_fov_deg=200.0)
     with pytest.raises(ValueError, match=r"backdrop.*desert"):
         TargetLocalizationParams(backdrop="desert")
-    with pytest.raises(ValueError, match=r"n_observers.*0"):
+    with pytest.raises(ValueError, match=r"n_robots.*0"):
         AerialGroundWorld(0)

@@ -59,6 +59,19 @@ def test_a_path_that_leads_nowhere(path):
         parallel_env(path)
 
 
+def test_what_is_no_world_is_told_what_it_lacks():
+    with pytest.raises(TypeError, match=r"OrderedDict is no World: it has no classes, meshes, n_robots"):
+        parallel_env("collections:OrderedDict")
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("value", ["x", float("nan"), None, ("x", "y"), (float("nan"), 1.0)])
+def test_every_impossible_parameter_is_named(scene, value):
+    for field in fields(SCENES[scene].params):
+        with pytest.raises(ValueError, match=field.name):
+            SCENES[scene].params(**{field.name: value})
+
+
 def test_every_scene_is_in_the_registry():
     pettingzoo = pytest.importorskip("pettingzoo")
     if not hasattr(pettingzoo, "parallel_registry"):
