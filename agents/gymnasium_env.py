@@ -47,6 +47,8 @@ def make(
     sensors = tuple(options.pop("sensors", ("image",)))
     seen_by_eyes = ("depth", "instances") if perception == "simulated" else ()
     env = parallel_env(scene, sensors=tuple(dict.fromkeys((*sensors, *seen_by_eyes))), **options)
+    if view not in (robots := env.possible_agents) and view != "team":
+        raise ValueError(f"view must be 'team' or one of {', '.join(robots)}, got {view!r}")
     localizer = Localizer(
         make_perceptor(perception, env), method, pose, max_detections=env.max_detections, options=method_options or {}
     )

@@ -115,6 +115,11 @@ def test_gymnasium_make(scene):
     env.close()
 
 
+def test_gymnasium_make_names_the_views():
+    with pytest.raises(ValueError, match="view must be 'team' or one of robot_0, robot_1, got 'robot'"):
+        gymnasium.make("covis/MultiRobot-v0", view="robot", **SMALL)
+
+
 def test_gymnasium_make_views_and_rendering():
     env = gymnasium.make("covis/MultiRobot-v0", view="team", render_mode="rgb_array", sensors=("depth",), **SMALL)
     check_env(env.unwrapped)
