@@ -23,8 +23,8 @@ def make_perceptor(name: str, env: CollaborativeEnv) -> Perceptor:
 
     Raises:
         ValueError: no perception of that name; classes that the weights do not know.
-        ImportError: `learned` without the packages of the extra `learned`, or what the weights' network needs.
-        covis.agents.perception.weights.WeightsError: weights are missing or altered.
+        ImportError: `learned` without the packages of the extra `learned`.
+        covis.agents.perception.weights.WeightsError: weights missing, altered, or of a network that is not installed.
     """
     kind, _, folder = name.partition(":")
     if name == "simulated":

@@ -75,6 +75,10 @@ def open_eyes(
 
     Raises:
         ValueError: a class that the network does not know, or an unknown kind of network.
-        ImportError: what that kind needs is not installed.
+        WeightsError: what that kind needs is not installed.
     """
-    return kind(weights.network.get(KIND, "compact")).perceptor(classes, weights, params, image_size)
+    try:
+        needed = kind(weights.network.get(KIND, "compact"))
+    except ImportError as error:
+        raise stored.WeightsError(str(error)) from error
+    return needed.perceptor(classes, weights, params, image_size)

@@ -1,6 +1,7 @@
 """The learned eyes: kernels against plain references, Monte Carlo dropout, weights on disk, bad input."""
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -447,6 +448,13 @@ def test_weights_of_an_unknown_network_are_refused():
         open_eyes(strange, CLASSES)
     with pytest.raises(ValueError, match="compact, maskrcnn"):
         kind("")
+
+
+def test_weights_of_a_network_that_is_not_installed_say_what_is_missing(monkeypatch):
+    monkeypatch.setitem(sys.modules, "torchvision", None)
+    monkeypatch.delitem(sys.modules, "covis.agents.perception.maskrcnn", raising=False)
+    with pytest.raises(stored.WeightsError, match=r"covis\[torchvision\]"):
+        open_eyes(replace(tiny_weights(), network={"kind": "maskrcnn", "classes": list(CLASSES)}), CLASSES)
 
 
 def test_eyes_of_a_folder(tmp_path):
