@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 Picture = NDArray[np.uint8]
 TITLES = (
-    "image",
     "masks",
     "depth of the centre, m",
     "v: attribute uncertainty",
@@ -32,12 +31,13 @@ BAND = 22
 """Height of the titles, px."""
 
 
-def figure(image: Picture, found: Detections) -> Picture:
+def figure(image: Picture, found: Detections, name: str = "image") -> Picture:
     """Five panels side by side (H + BAND, 5 W, 3): image, masks, depth, v and the square root of u.
 
     Args:
         image: (H, W, 3) RGB.
         found: detections in it, with masks.
+        name: title of the first panel.
 
     Raises:
         ValueError: detections without masks.
@@ -49,7 +49,7 @@ def figure(image: Picture, found: Detections) -> Picture:
     values = (graph.positions[:, 2], graph.attribute_variance, np.sqrt(graph.position_variance))
     panels = [image.copy(), _outlined(image, found.masks)]
     panels += [_painted(faded, found, value) for value in values]
-    return np.concatenate([_titled(p, title) for p, title in zip(panels, TITLES, strict=True)], axis=1)
+    return np.concatenate([_titled(p, title) for p, title in zip(panels, (name, *TITLES), strict=True)], axis=1)
 
 
 def require_drawable(file: Path) -> None:
@@ -84,7 +84,7 @@ def _liveliest(target: PerceptionTarget, weights: Weights, seed: int) -> Picture
         for number, image in enumerate(test_images(env, IMAGES, (TEST_KEY, seed))):
             found = eyes(image.observation, np.random.default_rng((seed, number)))
             if len(found) > best:
-                best, picture = len(found), figure(image.observation["image"], found)
+                best, picture = len(found), figure(image.observation["image"], found, target.name)
     finally:
         env.close()
     return picture

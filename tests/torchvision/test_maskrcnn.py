@@ -25,6 +25,15 @@ from covis.scripts.main import app
 SMALL = MaskRCNNParams(joint_classes(), backbone="resnet18", image_size=(160, 120), proposals=16, representation=64)
 
 
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Several threads wait for each other where other programs use the cores too."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 def network() -> PaperNetwork:
     torch.manual_seed(0)
     return PaperNetwork(SMALL)
