@@ -12,7 +12,7 @@ from ..agents.localizer import View
 from ..agents.perception import make_perceptor
 from ..envs.collaborative import CollaborativeEnv
 from ..fusion.channel import Channel, ChannelOptions
-from ..fusion.member import SAME_TIME_S, Localized, Match, Member, MemberOptions, Report
+from ..fusion.member import SAME_TIME_S, Localized, Match, Member, MemberOptions, Names, Report
 from ..matching import Matching, ObjectGraph
 from ..matching.bayes import bayes
 from ..matching.pose import Array
@@ -21,6 +21,10 @@ from .run_scene import identity, look_around, make_env, step_scripted
 from .settings import Settings
 
 WRONG_POSE_M = 5.0
+EXACT = 1e-10
+"""m^2 and rad^2: variances of a pose that is known exactly."""
+FALSE_NAME = 1_000_000
+"""From here on, names of detections that are of no object."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,8 +48,11 @@ class Instant:
     visible: list[Array]
 
 
-def instants(scene: str, settings: Settings) -> Iterator[Instant]:
-    """All steps of a scene's episodes, driven by its scripted controllers."""
+def instants(scene: str, settings: Settings, *, exact_poses: bool = False) -> Iterator[Instant]:
+    """All steps of a scene's episodes, driven by its scripted controllers.
+
+    With `exact_poses` the robots report where they truly are, and know that.
+    """
     env = make_env(scene, settings)
     perceive = make_perceptor(settings.perception, env)
     try:
@@ -55,6 +62,11 @@ def instants(scene: str, settings: Settings) -> Iterator[Instant]:
             while env.agents:
                 views = look_around(env, perceive, observations, (settings.seed, episode, step))
                 odometry = [np.asarray(o["odometry"], dtype=np.float64) for o in observations.values()]
+                if exact_poses:
+                    views = [
+                        replace(view, T_world_camera=T, pose_covariance=EXACT * np.eye(6))
+                        for view, T in zip(views, env.ground_truth().T_world_camera, strict=True)
+                    ]
                 yield _instant(env, episode, step * env.world.step_seconds, views, odometry)
                 observations = step_scripted(env)
                 step += 1
@@ -105,6 +117,11 @@ class TrueMatches:
 
     def __call__(self, source: Report, target: Report) -> Matching:
         return oracle(self.identity[source.robot, source.time], self.identity[target.robot, target.time])
+
+    def names(self, report: Report) -> NDArray[np.int64]:
+        """True identity of each detection; one of its own for what is no object."""
+        names = self.identity[report.robot, report.time]
+        return np.where(names >= 0, names, FALSE_NAME + np.arange(len(names)))
 
 
 @dataclass(frozen=True)
@@ -161,15 +178,19 @@ def play(
     matcher: Callable[[int], Match],
     fault: Fault = FAULTS[0],
     seed: int = 0,
+    names: Callable[[int], Names] | None = None,
 ) -> Iterator[Sight]:
-    """A team through the steps, every robot once per step; `matcher` gives an episode's matcher of reports."""
+    """A team through the steps, every robot once per step.
+
+    `matcher` gives an episode's matcher of reports, `names` its identities where tracks are to know them too.
+    """
     episode = None
     for number, step in enumerate(steps):
         if step.episode != episode:
             episode = step.episode
             rng = np.random.default_rng([seed, episode])
-            n, match = len(step.views), matcher(episode)
-            members = [Member(i, n, match, options) for i in range(n)]
+            n, match, known = len(step.views), matcher(episode), names and names(episode)
+            members = [Member(i, n, match, options, known) for i in range(n)]
             channel: Channel[tuple[Report, int]] = Channel(rng, fault.channel)
             offset = _horizontal(rng) * fault.wrong_pose_m
         for i, member in enumerate(members):

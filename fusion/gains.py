@@ -17,6 +17,9 @@ from .groups import Groups, group_detections
 from .objects import GAINS, FusedObjects, Gain, OwnObjects, fuse_given, own_objects, relative_pose
 from .refine import refine
 
+HUBER = 2.0
+"""Mahalanobis distance from which a measurement bends the poses no more."""
+
 
 def fuse(
     graphs: Sequence[ObjectGraph],
@@ -56,7 +59,7 @@ def fuse(
         # Poses between partners often rest on the same errors, one world pose per robot: only the frame's own count.
         partners = [j for j in range(len(graphs)) if j != frame]
         star = {(frame, j): pose for j in partners if (pose := relative_pose(poses, frame, j)) is not None}
-        return refine(graphs, star, groups, frame=frame, gate=gate, trust_own=trust_own).objects
+        return refine(graphs, star, groups, frame=frame, gate=gate, trust_own=trust_own, huber=HUBER).objects
     return fuse_given(
         graphs,
         poses,

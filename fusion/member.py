@@ -23,7 +23,7 @@ from .tracking import Batch, Tracker, TrackerOptions
 MIN_VARIANCE = 1e-8
 """m^2 and rad^2 added to a pose's covariance before it is inverted."""
 SAME_TIME_S = 1e-6
-NEAR = 16.0
+NEAR = 9.0
 """Squared Mahalanobis distance below which a partner's unmatched object could be one of the own."""
 AGREEMENT_RATE = 0.2
 """Weight of the newest frame in a partner's agreement."""
@@ -62,6 +62,8 @@ class Report:
 
 
 Match = Callable[[Report, Report], Matching]
+Names = Callable[[Report], NDArray[np.int64]]
+"""Identity (n,) of each detection of a report, where detections carry one: no track takes measurements of two."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,7 @@ class MemberOptions:
         filter_pose: filter the robot's own pose by its odometry; False = report it as it comes.
         tracker: of the objects; None = every frame stands alone.
         repeated: share of a measurement's variance that the next measurement of the object repeats (an object's centre
-            lies as far from its surface as before), which no averaging takes away.
+            lies as far from its surface as before, a network misjudges it as before), which no averaging takes away.
         odometry: errors of the robot's own motion.
     """
 
@@ -169,10 +171,18 @@ class Member:
     Args:
         robot: its index in a team of `n_robots`.
         match: matcher of two reports, the lower robot's first.
+        names: identities of a report's detections; None = they carry none.
     """
 
-    def __init__(self, robot: int, n_robots: int, match: Match, options: MemberOptions | None = None) -> None:
-        self.robot, self.n_robots, self.match = robot, n_robots, match
+    def __init__(
+        self,
+        robot: int,
+        n_robots: int,
+        match: Match,
+        options: MemberOptions | None = None,
+        names: Names | None = None,
+    ) -> None:
+        self.robot, self.n_robots, self.match, self.names = robot, n_robots, match, names
         self.options = options or MemberOptions()
         self.belief = PoseBelief(self.options.odometry)
         self.tracker = None if self.options.tracker is None else Tracker(self.options.tracker)
@@ -292,11 +302,24 @@ class Member:
         """All objects in the odometry frame, for the tracker: the own detections in their order, then the partners'."""
         own, T = self._own(moment, fused), moment.T_odometry_sensor
         theirs = np.flatnonzero(fused.members[:, self.robot] < 0)
-        theirs = theirs[~_near(fused.positions[theirs], fused.covariances[theirs], own)]
+        classes = None
+        if self.names is None:
+            theirs = theirs[~_near(fused.positions[theirs], fused.covariances[theirs], own)]
+        else:
+            mine, others = self.names(moment.own), self._others_names(moment, fused.members[theirs])
+            new = ~np.isin(others, mine)
+            theirs, classes = theirs[new], np.concatenate([mine, others[new]])
         positions = np.concatenate([own.positions, fused.positions[theirs]])
         covariances = np.concatenate([own.covariances, fused.covariances[theirs]])
         R = T[:3, :3]
-        return Batch(moment.own.time, transform(T, positions), R @ covariances @ R.T)
+        return Batch(moment.own.time, transform(T, positions), R @ covariances @ R.T, classes)
+
+    def _others_names(self, moment: _Moment, members: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Names (k,) of groups with members (k, N) of partners alone: that of the first partner."""
+        assert self.names is not None
+        names = {j: self.names(report) for j, report in moment.reports.items()}
+        first = (members >= 0).argmax(axis=1)
+        return np.array([names[j][row[j]] for j, row in zip(first.tolist(), members, strict=True)], dtype=np.int64)
 
     def _alone(self) -> Localized:
         now = self._moments[-1]

@@ -22,6 +22,8 @@ from .registration import RegistrationError, log_se3, register_points, rotation_
 
 FLOOR = 1e-10
 """m^2 added to every covariance before it is inverted."""
+HUBER_ROUNDS = 4
+"""Times the objects are weighed anew, given the poses."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,19 +153,19 @@ class _Solver:
         R, t = state[:, :3, :3], state[:, :3, 3]
         world = np.einsum("pij,mpj->mpi", R, p.q) + t
         S = R @ p.C @ R.transpose(0, 2, 1) + FLOOR * np.eye(3)
-        W: Array = (np.linalg.inv(S) * p.present[..., None, None]).astype(np.float64)
-        for _ in range(3 if self.huber is not None else 1):
+        full = np.linalg.inv(S)
+        weight = p.present.astype(np.float64)
+        seen = p.present.any(axis=1)
+        for _ in range(HUBER_ROUNDS if self.huber is not None else 1):
+            W = np.asarray(full * weight[..., None, None], dtype=np.float64)
             total = W.sum(axis=1) + 1e-300 * np.eye(3)
-            seen = p.present.any(axis=1)
             total[~seen] = np.eye(3)
             objects_covariance = np.linalg.inv(total)
             objects = np.einsum("mij,mj->mi", objects_covariance, np.einsum("mpij,mpj->mi", W, world))
             residual = (world - objects[:, None]) * p.present[..., None]
             if self.huber is not None:
-                full = np.linalg.inv(S)
                 distance = np.sqrt(np.einsum("mpi,mpij,mpj->mp", residual, full, residual))
                 weight = np.minimum(1.0, self.huber / np.maximum(distance, 1e-12)) * p.present
-                W = np.asarray(full * weight[..., None, None], dtype=np.float64)
         return world, W, objects, np.asarray(objects_covariance, dtype=np.float64), residual
 
     def _jacobians(self, state: Array, objects: Array) -> Array:

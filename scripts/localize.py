@@ -54,6 +54,7 @@ def localize(
     episodes: Annotated[int | None, typer.Option(help="Per scene; default 50 of the case study, else 10 or 5.")] = None,
     perception: Annotated[str, typer.Option(help="simulated | learned.")] = "simulated",
     min_score: Annotated[float | None, typer.Option(help="Less probable matches are not used.")] = None,
+    exact_poses: Annotated[bool, typer.Option("--exact-poses", help="Scenes: robots know where they are.")] = False,
     figure: Annotated[Path | None, typer.Option(help="Write a figure of the error against the team's size.")] = None,
     json_target: Annotated[str | None, typer.Option("--json", help="Write rows to FILE; - prints them.")] = None,
 ) -> None:
@@ -71,6 +72,7 @@ def localize(
                 episodes=episodes,
                 perception=perception,
                 min_score=MIN_SCORE if min_score is None else min_score,
+                exact_poses=exact_poses,
                 progress=progress,
             )
     except (ValueError, RuntimeError) as error:

@@ -3,11 +3,20 @@
 from dataclasses import replace
 from itertools import islice
 
+import numpy as np
 import pytest
 
 pytest.importorskip("pybullet")
 
-from covis.evaluation.localization import MIN_SCORE, accuracy, estimators, faults_of, localization_rows, sizes_of
+from covis.evaluation.localization import (
+    MIN_SCORE,
+    accuracy,
+    estimators,
+    faults_of,
+    localization_rows,
+    motion_of,
+    sizes_of,
+)
 from covis.evaluation.localization_team import FAULTS, BayesMatches, TrueMatches, instants, play
 from covis.evaluation.settings import Settings
 
@@ -36,10 +45,38 @@ def test_estimators_are_compared_on_the_same_detections():
 
 def test_protections_keep_a_wrong_robot_out():
     steps = first_steps(8, 4)
-    rows = faults_of(steps, lambda episode: TrueMatches.of(steps, episode))
+    rows = faults_of(steps, lambda episode: TrueMatches.of(steps, episode), motion_of("multi_robot", "simulated"))
     growth = {(row["protections"], row["fault"]): row["growth"] for row in rows}
     for fault in FAULTS[3:]:
         assert growth["with", fault.name] < 0.25 < growth["without", fault.name]
+
+
+def test_tracks_that_know_what_they_see_lose_less_by_a_delay():
+    steps = first_steps(10, 4)
+    motion = motion_of("multi_robot", "simulated")
+
+    def truth(episode):
+        return TrueMatches.of(steps, episode)
+
+    def names(episode):
+        return truth(episode).names
+
+    usual, ideal = (
+        {(row["protections"], row["fault"]): row["fused_m"] for row in faults_of(steps, truth, motion, names=known)}
+        for known in (None, names)
+    )
+    assert {protections for protections, _ in ideal} == {"with"}
+    assert ideal["with", "0.4 s delay"] <= usual["with", "0.4 s delay"]
+
+
+def test_exact_poses_leave_only_the_eyes_errors():
+    noisy, exact = (
+        next(instants("target_localization", replace(SETTINGS, n_robots=2), exact_poses=known))
+        for known in (False, True)
+    )
+    assert not np.allclose(noisy.views[0].T_world_camera, exact.views[0].T_world_camera, atol=1e-4)
+    assert np.trace(exact.views[0].pose_covariance) < 1e-6 < np.trace(noisy.views[0].pose_covariance)
+    np.testing.assert_array_equal(noisy.views[0].detections.graph.positions, exact.views[0].detections.graph.positions)
 
 
 def test_more_robots_localise_better():

@@ -204,16 +204,18 @@ def test_gate_keeps_honest_measurements():
 
 
 def test_huber_limits_one_gross_error():
-    rng = np.random.default_rng(9)
-    graphs, _, matchings, true_poses, _ = team(rng, n_objects=10)
-    moved = graphs[1].positions.copy()
-    moved[0] += [2.0, 2.0, 0.0]
-    broken = [graphs[0], ObjectGraph.from_positions(moved, covariances=graphs[1].covariances, up=UP), graphs[2]]
-
-    def error(refined):
-        return np.linalg.norm(refined.poses[0, 1].T_source_target[:3, 3] - true_poses[1][:3, 3])
-
-    assert error(refine(broken, {}, matchings, huber=2.0)) < 0.5 * error(refine(broken, {}, matchings))
+    plain, robust = [], []
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        graphs, _, matchings, true_poses, _ = team(rng, n_objects=10)
+        moved = graphs[1].positions.copy()
+        moved[0] += [2.0, 2.0, 0.0]
+        broken = [graphs[0], ObjectGraph.from_positions(moved, covariances=graphs[1].covariances, up=UP), graphs[2]]
+        for errors, huber in ((plain, None), (robust, 2.0)):
+            pose = refine(broken, {}, matchings, huber=huber).poses[0, 1]
+            errors.append(np.linalg.norm(pose.T_source_target[:3, 3] - true_poses[1][:3, 3]))
+    assert np.mean(robust) < 0.5 * np.mean(plain)
+    assert max(robust) < max(plain)
 
 
 def test_empty_teams():
@@ -228,3 +230,14 @@ def test_empty_teams():
     np.testing.assert_allclose(alone.objects.positions, 1.0)
     with pytest.raises(ValueError, match="frame"):
         refine([some], {}, {}, frame=3)
+
+
+def test_robust_covariances_are_covariances():
+    """Where matches are wrong, what the robust weights leave open is a covariance all the same."""
+    for seed in range(10):
+        graphs, poses, matchings, _, _ = team(np.random.default_rng(seed), n_robots=2)
+        pairs = matchings[0, 1].pairs
+        wrong = matching(np.column_stack([pairs[:, 0], np.roll(pairs[:, 1], 1)]))
+        refined = refine(graphs, poses, {(0, 1): wrong}, huber=1.0)
+        assert (np.linalg.eigvalsh(refined.objects.covariances) > 0).all()
+        assert np.linalg.eigvalsh(refined.poses[0, 1].covariance).min() > -1e-9
