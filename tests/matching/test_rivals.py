@@ -126,7 +126,7 @@ def test_rrwm_reaches_the_optimum_of_its_affinity_on_small_problems():
         best = max(indicator(m, 4) @ K @ indicator(m, 4) for m in permutations(range(4)))
         found = rrwm(source, target, distance_width_m2=0.18).pairs
         hits += indicator(found[:, 1], 4) @ K @ indicator(found[:, 1], 4) > best - 1e-9
-    assert hits >= 24
+    assert hits >= 26
 
 
 def test_width_is_a_multiple_of_the_median_variance_of_a_candidate():
@@ -225,10 +225,10 @@ def test_hypergraph_methods_reach_the_optimum_of_the_tensor_on_small_problems(ma
             return np.einsum("abc,a,b,c", T, x, x, x)
 
         best = max(score(m) for m in permutations(range(4)))
-        found = matcher(source, target).pairs
-        ratios.append(score(found[:, 1]) / best if len(found) == 4 else 0.0)
-    assert np.mean(np.array(ratios) > 1 - 1e-9) >= 0.6
-    assert np.mean(ratios) > 0.85
+        found = matcher(source, target, neighbours_factor=1.0, angle_width=None).pairs
+        ratios.append(score(found[:, 1]) / best)
+    assert np.mean(np.array(ratios) > 1 - 1e-9) >= 0.85
+    assert np.mean(ratios) > 0.95
 
 
 def test_lifted_form_agrees_with_its_gradient_and_ascent_never_loses_to_its_start():
@@ -345,8 +345,8 @@ def test_mos_reaches_the_optimum_of_its_three_orders_on_small_problems():
         best = max(score(m) for m in permutations(range(4)))
         found = mos(source, target, distance_width_m2=0.18).pairs
         ratios.append(score(found[:, 1]) / best)
-    assert np.mean(np.array(ratios) > 1 - 1e-9) >= 0.6
-    assert np.mean(ratios) > 0.85
+    assert np.mean(np.array(ratios) > 1 - 1e-9) >= 0.8
+    assert np.mean(ratios) > 0.95
 
 
 def as_list(matching):
