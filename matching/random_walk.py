@@ -1,4 +1,4 @@
-"""Random walks over candidate matches: sparse affinities, steps, and the jumps of Cho, Lee and Lee 2010."""
+"""Random walks over candidate matches: affinities by windows, steps, and the jumps of Cho, Lee and Lee 2010."""
 
 from __future__ import annotations
 
