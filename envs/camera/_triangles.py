@@ -1,6 +1,7 @@
 """First pass: bodies' triangles into the depth buffer, and their shadows on the ground into two masks, in Numba.
 
-Numba's cache watches one file at a time, so every kernel here calls only kernels of this file.
+Numba's cache watches one file at a time, so every kernel here calls only kernels of this file. Shadows are projected,
+clipped and filled as bodies are, by the same kernels, and stay beside them for that.
 """
 
 from __future__ import annotations
