@@ -39,7 +39,7 @@ class ChannelOptions:
     bandwidth_bytes_s: float | None = None
 
     def __post_init__(self) -> None:
-        if self.latency_s < 0 or self.jitter_s < 0:
+        if not (self.latency_s >= 0 and self.jitter_s >= 0):
             raise ValueError(f"latency_s and jitter_s must be non-negative, got {self.latency_s} and {self.jitter_s}")
         if not 0 <= self.loss <= 1:
             raise ValueError(f"loss must lie in [0, 1], got {self.loss}")

@@ -13,7 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..matching.graph import Matching, ObjectGraph
-from ..matching.pose import Array, RelativePose, adjoint, exp_se3, invert, transform
+from ..matching.pose import (
+    Array,
+    RelativePose,
+    adjoint,
+    check_covariance,
+    check_pose,
+    exp_se3,
+    invert,
+    transform,
+)
 from .channel import BYTES_PER_NUMBER, message_size
 from .gains import fuse
 from .objects import FusedObjects, Gain, OwnObjects, agreement, own_objects
@@ -196,11 +205,20 @@ class Member:
     ) -> Report:
         """Take in an own observation, of a later time than the last; the report for the partners.
 
+        Args:
+            time: s.
+            pose: (4, 4) noisy T_world_sensor, with covariance (6, 6), right perturbation.
+            odometry: (4, 4) own motion since the last observation; None = unknown.
+
         Raises:
-            ValueError: the time is not later than the last.
+            ValueError: the time is not later than the last; no pose, or no covariance. Nothing is taken in then.
         """
+        if not np.isfinite(time):
+            raise ValueError(f"time must be finite, got {time}")
         if self._moments and time <= self._moments[-1].own.time:
             raise ValueError(f"time {time} is not later than the last, {self._moments[-1].own.time}")
+        pose, pose_covariance = check_pose(pose, "pose"), check_covariance(pose_covariance, "pose_covariance")
+        odometry = None if odometry is None else check_pose(odometry, "odometry")
         step = odometry if self.options.filter_pose else None
         self.belief.update(pose, pose_covariance, step, graph.up)
         assert self.belief.T is not None
@@ -216,7 +234,15 @@ class Member:
         return own
 
     def localize(self, arrived: Iterable[Report]) -> Localized:
-        """Take in reports; the own detections of the last `look`, as known now."""
+        """Take in reports; the own detections of the last `look`, as known now.
+
+        Raises:
+            ValueError: a report of this robot itself, or of none of the team. No report is taken in then.
+        """
+        arrived = list(arrived)
+        for report in arrived:
+            if report.robot == self.robot or not 0 <= report.robot < self.n_robots:
+                raise ValueError(f"robot {self.robot} of {self.n_robots} got a report of robot {report.robot}")
         touched = {}
         for report in arrived:
             moment = self._moment_of(report.time)

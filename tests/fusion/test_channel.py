@@ -68,3 +68,11 @@ def test_message_size_of_a_graph():
 def test_bad_options_raise(field, value):
     with pytest.raises(ValueError, match=field):
         ChannelOptions(**{field: value})
+
+
+@pytest.mark.parametrize(
+    "bad", [{"latency_s": np.nan}, {"jitter_s": -0.1}, {"loss": 1.5}, {"loss": np.nan}, {"bandwidth_bytes_s": 0.0}]
+)
+def test_impossible_channels_are_named(bad):
+    with pytest.raises(ValueError, match=next(iter(bad))):
+        ChannelOptions(**bad)

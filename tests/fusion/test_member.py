@@ -1,5 +1,7 @@
 """A team on paper: objects on the plane, robots around them, everything drawn from the noise that is reported."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -172,3 +174,23 @@ def test_time_must_go_on():
     member.look(1.0, *look)
     with pytest.raises(ValueError, match=r"time 1\.0 is not later"):
         member.look(1.0, *look)
+
+
+def test_what_is_refused_leaves_no_trace():
+    options = MemberOptions(tracker=TRACKER)
+    world, team = World(8, 2), [Member(i, 2, same_order, options) for i in range(2)]
+    graph, pose, covariance, odometry = world.look(0)
+    for bad, words in (
+        ((np.nan, graph, pose, covariance, odometry), "time must be finite"),
+        ((0.0, graph, pose[:3, :3], covariance, odometry), "pose must"),
+        ((0.0, graph, pose, np.eye(3), odometry), "pose_covariance must have shape"),
+        ((0.0, graph, pose, covariance, 2 * odometry), "odometry"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            team[0].look(*bad)
+    reports = [member.look(0.0, *world.look(i)) for i, member in enumerate(team)]
+    for stranger in (0, 2, -1):
+        with pytest.raises(ValueError, match=rf"robot 0 of 2 got a report of robot {stranger}"):
+            team[0].localize([reports[1], replace(reports[1], robot=stranger)])
+    assert (team[0].localize([]).own.n_robots == 1).all()
+    assert (team[0].localize([reports[1]]).own.n_robots == 2).all()
