@@ -146,8 +146,9 @@ def scene_rows(scene: str, settings: Settings, min_score: float, exact_poses: bo
     settings = _with_episodes(settings, scene)
     steps = list(instants(scene, settings, exact_poses=exact_poses))
     rows = []
+    matches = [BayesMatches(min_score) for _ in range(settings.episodes or 1)]
     for name, options in estimators(scene, settings.perception).items():
-        sights = list(play(steps, options, lambda _: BayesMatches(min_score), seed=settings.seed))
+        sights = list(play(steps, options, lambda episode: matches[episode], seed=settings.seed))
         head: Row = {"part": "scenes", "target": scene, "estimator": name, "episodes": settings.episodes}
         head |= {"frames": len(steps), "min_score": min_score}
         rows.append(head | {"objects": "all"} | accuracy(sights))
@@ -238,8 +239,9 @@ def _tracks(sights: Sequence[Sight]) -> list[list[dict[int, int]]]:
 def fault_rows(settings: Settings, min_score: float) -> list[Row]:
     settings = replace(settings, episodes=settings.episodes or TEAM_EPISODES, n_robots=CONSISTENT_ROBOTS)
     steps = list(instants(TEAM_SCENE, settings))
+    matches = [BayesMatches(min_score) for _ in range(settings.episodes or 1)]
     matchers: dict[str, Callable[[int], Match]] = {
-        "bayes": lambda _: BayesMatches(min_score),
+        "bayes": lambda episode: matches[episode],
         "true": lambda episode: TrueMatches.of(steps, episode),
     }
     head = {"part": "faults", "target": TEAM_SCENE, "episodes": settings.episodes, "min_score": min_score}

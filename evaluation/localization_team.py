@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -88,20 +88,26 @@ def _instant(env: CollaborativeEnv, episode: int, time: float, views: list[View]
 
 
 class BayesMatches:
-    """Matches of reports by `bayes`, poses known; it remembers, since all robots of a team ask for the same pairs."""
+    """Matches of reports by `bayes`, poses known; it remembers: robots of a team, and teams that differ in what they
+    make of their reports, ask for the same pairs."""
 
     def __init__(self, min_score: float) -> None:
         self.min_score = min_score
-        self._known: dict[tuple[int, int], Matching] = {}
-        self._alive: list[Report] = []
+        self._known: dict[tuple[Hashable, Hashable], Matching] = {}
 
     def __call__(self, source: Report, target: Report) -> Matching:
-        key = id(source), id(target)
+        key = _content(source), _content(target)
         if key not in self._known:
             prior = source.relative(target)
             self._known[key] = bayes(source.steadied, target.steadied, prior=prior, min_score=self.min_score)
-            self._alive += [source, target]  # an id must not be given away again
         return self._known[key]
+
+
+def _content(report: Report) -> Hashable:
+    graph = report.steadied
+    covariances = b"" if graph.covariances is None else graph.covariances.tobytes()
+    arrays = (graph.positions, graph.attributes, report.T_world_sensor, report.covariance)
+    return report.robot, report.time, covariances, *(x.tobytes() for x in arrays)
 
 
 @dataclass(frozen=True)
