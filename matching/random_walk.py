@@ -28,7 +28,7 @@ class Affinity(NamedTuple):
     Attributes:
         weight: (n, n') a.
         diagonal: (n, n') affinity of a candidate with itself.
-        first, second: (t,) the pairs i' < j' of target objects by distance, then pairs of no affinity to fill the block.
+        first, second: (t,) the pairs i' < j' of target objects by distance, pairs of no affinity to fill the block.
         low, high: (n, n) blocks where the window of i and j begins and ends.
         start: (n, n) where its entries begin in `value`; i, j and j, i have the same.
         value: D.
