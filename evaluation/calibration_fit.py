@@ -7,13 +7,15 @@ truth; weights are then fitted to that by gradient, since only the mixing of the
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from fnmatch import fnmatch
 from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
+from scipy.optimize import linprog, minimize
+from scipy.sparse import block_diag, csr_array
 
 from ..matching import bayes
 from ..matching.bayes_calibration import CALIBRATIONS, Calibration, Evidence, calibrated
@@ -24,6 +26,8 @@ from .datasets import Frame, View, load_dataset
 from .synthetic import frames as generated
 from .synthetic import problem_names
 
+GENERATED = "synthetic-"
+"""Before the name of a generated problem, as in the suites."""
 LEAST = 1e-3
 """Probabilities closer to 0 or 1 count as so close, so that one error of a certain match does not decide a fit."""
 RIDGE = 1e-4
@@ -64,18 +68,29 @@ def pairs_of(frame: Frame) -> list[tuple[View, View]]:
 
 
 def collect(
-    target: str, *, frames: int | None = None, seed: int = 0, progress: Callable[[int, int], None] = lambda d, n: None
+    target: str,
+    kind: str,
+    *,
+    frames: int | None = None,
+    seed: int = 0,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[PairEvidence]:
-    """The evidence of all pairs of views of a dataset folder, or of generated pairs (a name of `problem_names`).
+    """The evidence of all pairs of views of a dataset folder, or of generated pairs.
 
     Args:
-        target: folder or name.
+        target: a folder, or "synthetic-" and a name of `problem_names`.
+        kind: entry of CALIBRATIONS that is wanted; for "unseen" the fields of view of generated pairs are hidden.
         frames: at most so many frames, evenly spread; of generated pairs their number, 100 by default.
         seed: of the detections' order; of generated pairs.
         progress: called with frames done and frames in all.
+
+    Raises:
+        DatasetError: a folder that cannot be read.
     """
-    if target in problem_names():
-        every = list(generated(target, seed, range(100 if frames is None else frames)))
+    problem = target.removeprefix(GENERATED)
+    if target != problem and problem in problem_names():
+        every = list(generated(problem, seed, range(100 if frames is None else frames)))
+        every = [_hidden(frame) for frame in every] if kind == "unseen" else every
     else:
         data = load_dataset(target, seed)
         number = len(data) if frames is None else min(frames, len(data))
@@ -87,6 +102,12 @@ def collect(
     return found
 
 
+def _hidden(frame: Frame) -> Frame:
+    """The frame without its fields of view."""
+    views = (replace(view, graph=replace(view.graph, horizontal_fov_rad=None)) for view in frame.views)
+    return replace(frame, views=tuple(views))
+
+
 def _solved(target: str, group: int, a: View, b: View) -> PairEvidence:
     solved = bayes(a.graph, b.graph).diagnostics
     truth = (a.identity[:, None] == b.identity) & (a.identity[:, None] >= 0)
@@ -94,82 +115,75 @@ def _solved(target: str, group: int, a: View, b: View) -> PairEvidence:
 
 
 class Entries(NamedTuple):
-    """All possible matches of many pairs: marginals (e, k), truth (e,), pair (e,) and weight (e,) of each.
+    """All possible matches e of many pairs p, and all their modes k.
 
-    With the modes' features (p, k, f), which of them there are (p, k), and the pairs' features (p, g).
+    Attributes:
+        marginals: sparse (e, k) probability of each match under each mode of its pair.
+        truth, weight: (e,) whether a match is right, and how much it counts.
+        pair_of_match, pair_of_mode: (e,), (k,) in ascending order.
+        modes, pairs: features (k, f) of the modes and (p, g) of the pairs.
     """
 
-    marginals: Array
+    marginals: csr_array
     truth: Array
-    pair: NDArray[np.int64]
     weight: Array
+    pair_of_match: NDArray[np.int64]
+    pair_of_mode: NDArray[np.int64]
     modes: Array
-    there: NDArray[np.bool_]
     pairs: Array
 
 
 def entries(pairs: Sequence[PairEvidence], weights: Mapping[str, float]) -> Entries:
     """Pairs as arrays; matches that no mode holds possible say nothing of the weights and are left out."""
-    most = max(len(p.marginals) for p in pairs)
-    modes = np.zeros((len(pairs), most, pairs[0].evidence.modes.shape[1]))
-    there = np.zeros((len(pairs), most), dtype=bool)
-    marginals, truth, pair, weight = [], [], [], []
-    for i, p in enumerate(pairs):
-        k = len(p.marginals)
-        modes[i, :k], there[i, :k] = p.evidence.modes, True
-        held = (p.marginals > LEAST).any(axis=0)
-        marginals.append(np.pad(p.marginals[:, held].T, ((0, 0), (0, most - k))))
-        truth.append(p.truth[held].astype(float))
-        pair.append(np.full(held.sum(), i))
-        weight.append(np.full(held.sum(), weights.get(p.target, 1.0)))
-    total = sum(weights.get(p.target, 1.0) for p in pairs)
+    held = [(p.marginals > LEAST).any(axis=0) for p in pairs]
+    own = [weights.get(p.target, 1.0) for p in pairs]
+    matches, modes = [int(x.sum()) for x in held], [len(p.marginals) for p in pairs]
+    numbers = np.arange(len(pairs))
     return Entries(
-        np.concatenate(marginals),
-        np.concatenate(truth),
-        np.concatenate(pair),
-        np.concatenate(weight) / total,
-        modes,
-        there,
+        csr_array(block_diag([csr_array(p.marginals[:, x].T) for p, x in zip(pairs, held, strict=True)], format="csr")),
+        np.concatenate([p.truth[x] for p, x in zip(pairs, held, strict=True)]).astype(float),
+        np.repeat(own, matches) / sum(own),
+        np.repeat(numbers, matches),
+        np.repeat(numbers, modes),
+        np.concatenate([p.evidence.modes for p in pairs]),
         np.stack([p.evidence.pair for p in pairs]),
     )
 
 
 def objective(theta: Array, x: Entries) -> tuple[float, Array]:
     """Log score of all possible matches, nats a pair, and its gradient; theta is [terms, damping, offset]."""
-    f, g = x.modes.shape[2], x.pairs.shape[1]
+    f, g = x.modes.shape[1], x.pairs.shape[1]
     terms, damping, offset = theta[:f], theta[f : f + g], theta[f + g :]
-    scale = np.exp(x.pairs @ damping)[:, None]
-    linear = x.modes @ terms
-    log = np.where(x.there, scale * linear + (x.pairs @ offset)[:, None], -np.inf)
-    top = np.maximum(log.max(axis=1, initial=0.0), 0.0)[:, None]
-    share = np.exp(log - top)
-    share /= share.sum(axis=1, keepdims=True) + np.exp(-top)
-    own = share[x.pair]
-    P = (own * x.marginals).sum(axis=1)
+    factor = np.exp(x.pairs @ damping)[x.pair_of_mode]
+    scaled = factor * (x.modes @ terms)
+    share = _shares(scaled + (x.pairs @ offset)[x.pair_of_mode], x.pair_of_mode, len(x.pairs))
+    P = x.marginals @ share
     inside = (P > LEAST) & (P < 1 - LEAST)
     Q = np.clip(P, LEAST, 1 - LEAST)
     value = -(x.weight * (x.truth * np.log(Q) + (1 - x.truth) * np.log1p(-Q))).sum()
     slope = np.where(inside, x.weight * (Q - x.truth) / (Q * (1 - Q)), 0.0)
     # d P / d log evidence of a mode = its share (its own marginal - P).
-    by_entry = slope[:, None] * own * (x.marginals - P[:, None])
-    by_mode = np.stack([np.bincount(x.pair, column, len(x.pairs)) for column in by_entry.T], axis=1)
-    by_scaled = by_mode * scale
-    gradient = np.concatenate(
-        [
-            np.einsum("pk,pkf->f", by_scaled, x.modes),
-            x.pairs.T @ (by_scaled * linear).sum(axis=1),
-            x.pairs.T @ by_mode.sum(axis=1),
-        ]
-    )
+    all_matches = np.bincount(x.pair_of_match, slope * P, len(x.pairs))
+    by_mode = share * (x.marginals.T @ slope - all_matches[x.pair_of_mode])
+    per_pair = [np.bincount(x.pair_of_mode, y, len(x.pairs)) for y in (by_mode * scaled, by_mode)]
+    gradient = np.concatenate([x.modes.T @ (by_mode * factor), x.pairs.T @ per_pair[0], x.pairs.T @ per_pair[1]])
     return float(value), gradient
+
+
+def _shares(log: Array, pair_of_mode: NDArray[np.int64], n_pairs: int) -> Array:
+    """Posterior (k,) of modes of log evidence (k,), each against its pair's others and "nothing in common"."""
+    top = np.zeros(n_pairs)
+    np.maximum.at(top, pair_of_mode, log)
+    share = np.exp(log - top[pair_of_mode])
+    total = np.bincount(pair_of_mode, share, n_pairs) + np.exp(-top)
+    result: Array = share / total[pair_of_mode]
+    return result
 
 
 def probabilities(pair: PairEvidence, calibration: Calibration) -> Array:
     """Match probabilities (n, m), as `bayes` mixes them with its default prior of sharing anything."""
     log = calibrated(pair.evidence, calibration)
-    top = max(log.max(initial=0.0), 0.0)
-    share = np.exp(log - top)
-    share /= share.sum() + np.exp(-top)
+    share = _shares(log, np.zeros(len(log), dtype=np.int64), 1)
     P: Array = np.minimum(np.tensordot(share, pair.marginals, axes=1), 1.0)
     return P
 
@@ -201,7 +215,7 @@ def fit(pairs: Sequence[PairEvidence], weights: Mapping[str, float] | None = Non
     if not pairs:
         raise ValueError("there is no pair of views to fit to")
     x = entries(pairs, weights or {})
-    f, g = x.modes.shape[2], x.pairs.shape[1]
+    f, g = x.modes.shape[1], x.pairs.shape[1]
     free = np.ones(f + 2 * g, dtype=bool)
     free[f] = False  # A constant factor of all evidence is in the terms already.
     theta = np.zeros(f + 2 * g)
@@ -261,12 +275,14 @@ class Refit:
             (`whole_f1` ...), of the calibration that the package holds (`held_...`), of the one fitted (`fitted_...`),
             and of those fitted to one half of the pairs on the other half (`halves_...`).
         left_out: pairs that another calibration is for.
+        bound: `monotone_bound` of what the package's calibration emits of the targets.
     """
 
     kind: str
     fitted: Calibration
     rows: list[dict[str, Any]]
     left_out: int
+    bound: float
 
 
 def refit(
@@ -277,7 +293,7 @@ def refit(
     Args:
         kind: entry of CALIBRATIONS.
         collected: of `collect`.
-        weights: as for `fit`.
+        weights: as for `fit`; names may be patterns such as "synthetic-*".
         seed: of the halves.
 
     Raises:
@@ -287,9 +303,7 @@ def refit(
     if not pairs:
         raise ValueError(f"no pair of views is of the kind {kind!r}; there are {sorted({p.kind for p in collected})}")
     targets = _by_target(pairs)
-    unknown = set(weights or {}) - targets.keys()
-    if unknown:
-        raise ValueError(f"a weight for {sorted(unknown)[0]!r}, which is none of {', '.join(targets)}")
+    weights = _spelt_out(weights or {}, list(targets))
     fitted, parts = fit(pairs, weights), halves(pairs, seed)
     compared = {"whole": [(pairs, CALIBRATIONS["whole"])], "held": [(pairs, CALIBRATIONS[kind])]}
     compared |= {"fitted": [(pairs, fitted)]}
@@ -300,18 +314,70 @@ def refit(
         for name, parts_of in compared.items():
             row |= {f"{name}_{key}": value for key, value in _measured(target, parts_of).items()}
         rows.append(row)
-    return Refit(kind, fitted, rows, len(collected) - len(pairs))
+    bound = monotone_bound([_kept(own, CALIBRATIONS[kind])[:2] for own in targets.values()])
+    return Refit(kind, fitted, rows, len(collected) - len(pairs), bound)
+
+
+def _spelt_out(weights: Mapping[str, float], targets: Sequence[str]) -> dict[str, float]:
+    """Weight of each target named, by patterns; the last that fits counts."""
+    for pattern in weights:
+        if not any(fnmatch(target, pattern) for target in targets):
+            raise ValueError(f"a weight for {pattern!r}, which is none of {', '.join(targets)}")
+    return {target: weight for pattern, weight in weights.items() for target in targets if fnmatch(target, pattern)}
 
 
 def _measured(target: str, parts: Sequence[tuple[Sequence[PairEvidence], Calibration]]) -> dict[str, Any]:
     """F1, ECE and number of what is emitted of one target, parts with their own calibrations pooled."""
     scores, right, common = [], [], 0
     for pairs, calibration in parts:
-        s, r, c = emitted([pair for pair in pairs if pair.target == target], calibration)
-        kept = s >= calibration.min_score
-        scores.append(s[kept])
-        right.append(r[kept])
+        s, r, c = _kept([pair for pair in pairs if pair.target == target], calibration)
+        scores.append(s)
+        right.append(r)
         common += c
     s, r = np.concatenate(scores), np.concatenate(right)
     ece = expected_calibration_error(s, r) if len(s) else None
     return {"f1": _f1(s, r, common, 0.0), "ece": ece, "emitted": len(s)}
+
+
+def _kept(pairs: Sequence[PairEvidence], calibration: Calibration) -> tuple[Array, NDArray[np.bool_], int]:
+    """What `bayes` would emit: scores, which are right, and the number of common objects."""
+    scores, right, common = emitted(pairs, calibration)
+    kept = scores >= calibration.min_score
+    return scores[kept], right[kept], common
+
+
+def monotone_bound(sets: Sequence[tuple[Array, NDArray[np.bool_]]], levels: int = 40, bins: int = 10) -> float:
+    """What the largest debiased ECE of the sets is at least, whatever monotone map the scores of all go through.
+
+    A linear program over step functions of `levels` steps, with the truth at hand; a gap of the size that chance makes
+    likely (one standard deviation of a bin) costs nothing, as in `expected_calibration_error`.
+
+    Args:
+        sets: scores (k,) of emitted matches, and which are right (k,).
+        levels: steps, at quantiles of all scores together.
+        bins: of equal mass, per set.
+    """
+    sets = [(scores, right) for scores, right in sets if len(scores)]
+    if not sets:
+        return 0.0
+    edges = np.quantile(np.concatenate([scores for scores, _ in sets]), np.linspace(0, 1, levels + 1)[1:-1])
+    # Unknown: the map's levels, the gap of every bin, the largest ECE.
+    size = levels + len(sets) * bins + 1
+    rows = [np.eye(size)[k] - np.eye(size)[k + 1] for k in range(levels - 1)]
+    limits = [0.0] * (levels - 1)
+    for s, (scores, right) in enumerate(sets):
+        level = np.searchsorted(edges, scores, side="right")
+        error = -np.eye(size)[-1]
+        for b, own in enumerate(np.array_split(np.argsort(scores, kind="stable"), bins)):
+            if not len(own):
+                continue
+            at, accuracy = levels + s * bins + b, float(right[own].mean())
+            chance = np.sqrt(accuracy * (1 - accuracy) / (len(own) - 1)) if len(own) > 1 else 0.0
+            error[at] = len(own) / len(scores)
+            mean = np.bincount(level[own], minlength=size) / len(own)
+            rows += [sign * mean - np.eye(size)[at] for sign in (1, -1)]
+            limits += [sign * accuracy + chance for sign in (1, -1)]
+        rows.append(error)
+        limits.append(0.0)
+    bounds = [(0, 1)] * levels + [(0, None)] * (size - levels)
+    return float(linprog(np.eye(size)[-1], A_ub=np.array(rows), b_ub=limits, bounds=bounds).fun)

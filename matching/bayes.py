@@ -66,8 +66,8 @@ def bayes(
         prior: noisy relative pose, if known; its Gaussian enters the evidence.
         rng: not used, the method is deterministic.
         min_score: matches of a lower probability are not made. A threshold of half the F1 to be expected maximises
-            the F1 pooled over many pairs: by default .42, without a prior .28 for cameras that report full covariances
-            and .21 for views of at most five objects that know their field of view otherwise.
+            the F1 pooled over many pairs: by default the `min_score` of the pair's
+            entry in `bayes_calibration.CALIBRATIONS`, between .21 and .43.
         common_probability: prior probability that two views show any common object; not used with a prior pose.
         bearing_std_rad: error across the viewing ray of graphs without full covariances, radians.
         class_sharpness: power that turns class confidences into likelihoods.

@@ -49,10 +49,10 @@ _CONCENTRATED = np.array([1.0, 0.0, 0.0, 0.0, 0.0])
 CALIBRATIONS = {
     # Gravity known, and no field of view.
     "unseen": Calibration(
-        np.array([0.432, 0.142, -0.258, 0.125, 0.445, 1.526, 1.068, -1.824]),
-        np.array([0.0, 0.61, 0.02, 0.22, 0.0]),
-        np.array([2.9, 1.54, 0.29, -0.24, 0.0]),
-        0.42,
+        np.array([0.554, 0.07, -0.276, 0.069, 0.239, 1.443, 2.679, -3.363]),
+        np.array([0.0, 0.562, 0.375, 0.166, -0.351]),
+        np.array([6.967, 2.808, 4.423, -0.177, -2.004]),
+        0.43,
     ),
     # Cameras that report full covariances: one network's errors in one image go together.
     "eyes": Calibration(

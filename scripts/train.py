@@ -119,10 +119,11 @@ def policy(
 def calibration(
     kind: Annotated[str, typer.Argument(help="Which weights: unseen | eyes | fields.")],
     targets: Annotated[
-        list[str], typer.Argument(help="Dataset folders, or generated problems such as cad-hard.", metavar="TARGET...")
+        list[str],
+        typer.Argument(help="Dataset folders, or generated problems such as synthetic-cad-hard.", metavar="TARGET..."),
     ],
     weight: Annotated[
-        list[str] | None, typer.Option(help="TARGET=W: its pairs count W times; repeatable. Default 1.")
+        list[str] | None, typer.Option(help="TARGET=W: its pairs count W times; TARGET may be a pattern. Default 1.")
     ] = None,
     frames: Annotated[
         int | None, typer.Option(help="At most so many of each, evenly spread; of generated ones so many, else 100.")
@@ -145,7 +146,7 @@ def calibration(
         pairs = []
         for target in targets:
             with progress_bar(f"evidence of {Path(target).name}") as progress:
-                pairs += collect(target, frames=frames, seed=seed, progress=progress)
+                pairs += collect(target, kind, frames=frames, seed=seed, progress=progress)
         found = refit(kind, pairs, weights, seed)
     except (ValueError, RuntimeError, OSError) as error:
         fail(error)
@@ -154,11 +155,12 @@ def calibration(
         for name, value in found.fitted._asdict().items()
     }
     if json_target is not None:
-        content = {"kind": kind, **fitted, "weights": weights, "seed": seed, "rows": found.rows}
+        content = {"kind": kind, **fitted, "weights": weights, "seed": seed, "bound": found.bound, "rows": found.rows}
         Path(json_target).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     console.print(_comparison(found.rows))
     for name, value in fitted.items():
         console.print(f"{name}: {value}", highlight=False)
+    console.print(f"ECE of some target after any monotone map of the held scores: at least {found.bound:.3f}")
     if found.left_out:
         err.print(f"{found.left_out} pairs are of another kind and were left out")
 

@@ -21,9 +21,11 @@ import typer
 from markdown_it import MarkdownIt
 from typer.testing import CliRunner
 
+from covis.evaluation.calibration_fit import GENERATED
 from covis.evaluation.methods import Method
 from covis.evaluation.settings import SCENE_NAMES
 from covis.evaluation.suites import SUITES
+from covis.evaluation.synthetic import problem_names
 from covis.scripts.main import app
 from covis.scripts.speed import AREAS
 
@@ -121,6 +123,12 @@ def parsed(words: list[str]) -> tuple[list[str], dict[str, Any]]:
     return name, command.make_context(" ".join(name), rest).params
 
 
+def is_generated(target: str) -> bool:
+    """Whether a target, with a shell's braces, names generated problems."""
+    pattern = re.sub(r"{(.*?)}", lambda braces: f"({braces[1].replace(',', '|')})", target)
+    return any(re.fullmatch(pattern, GENERATED + problem) for problem in problem_names())
+
+
 def check_parameters(name: list[str], params: dict[str, Any], page: Page) -> None:
     """What parsing alone does not see: names of targets, methods and areas."""
     local = {path.stem for path in Path().glob("*.py")}
@@ -130,7 +138,7 @@ def check_parameters(name: list[str], params: dict[str, Any], page: Page) -> Non
             method.load()
     targets = params.get("targets") or [params[k] for k in ("target", "scene") if k in params]
     for target in targets if name[0] in ("benchmark", "view", "record", "train") else ():
-        known = target in {*SCENE_NAMES, *SUITES, "perception"} or ":" in target
+        known = target in {*SCENE_NAMES, *SUITES, "perception"} or ":" in target or is_generated(target)
         if not (known or target in page.made or target.startswith(("path/to/", "../shared/data")) or target.isupper()):
             raise ValueError(
                 f"target {target!r} is no scene or suite, was not made above on this page, and is no placeholder "

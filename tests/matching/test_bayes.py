@@ -11,7 +11,7 @@ import pytest
 from covis.matching import ObjectGraph, RelativePose, bayes
 from covis.matching.bayes_assignment import assignment_marginals
 from covis.matching.bayes_calibration import CALIBRATIONS, FEW, Evidence, calibrated, kind_of, pair_features
-from covis.matching.bayes_overlap import MARGIN_RAD, REACH, overlap_features
+from covis.matching.bayes_overlap import MARGIN_RAD, N_FEATURES, REACH, overlap_features
 from covis.matching.bayes_prepare import Settings, class_evidence, height_correction, levelling_rotation, prepare
 from covis.matching.metrics import count, expected_calibration_error, is_correct, pooled
 from covis.matching.pose import invert
@@ -451,7 +451,7 @@ def test_pair_features():
 
 def test_calibrated_evidence_keeps_the_order_of_equal_modes_and_falls_where_matches_say_little():
     rng = np.random.default_rng(13)
-    features = rng.standard_normal((20, 8))
+    features = rng.standard_normal((20, N_FEATURES))
     features[:, 1:] = features[0, 1:]
     telling, vague = (Evidence(features, np.array([1.0, place, 0.0, 0.0, 0.0])) for place in (1.0, -1.0))
     for calibration in CALIBRATIONS.values():
