@@ -53,17 +53,18 @@ def distance_affinity(s: Array, t: Array, width_m2: float, weight: Array, diagon
         weight: (n, n') of each candidate, in [0, 1].
         diagonal: (n, n') affinity of each candidate with itself.
     """
-    first, second = np.triu_indices(len(t), 1)
-    distance = t[first, second]
+    pairs = np.array(np.triu_indices(len(t), 1))
+    distance = t[tuple(pairs)]
     order = np.argsort(distance, kind="stable")
-    fill = (0, -len(order) % BLOCK)
-    ascending = np.pad(distance[order], fill, constant_values=np.inf)
+    k, size = len(order), BLOCK * -(-len(order) // BLOCK)
+    ascending, (first, second) = np.full(size, np.inf), np.zeros((2, size), dtype=np.int64)
+    ascending[:k], first[:k], second[:k] = distance[order], *pairs[:, order]
     reach = np.sqrt(-np.log(NEGLIGIBLE) * width_m2)
     low = np.searchsorted(ascending, s - reach) // BLOCK
     high = -(-np.searchsorted(ascending, s + reach, side="right") // BLOCK)
     start, value = _exponents(s, ascending, width_m2, low, high)
     np.exp(value, out=value)
-    return Affinity(weight, diagonal, np.pad(first[order], fill), np.pad(second[order], fill), low, high, start, value)
+    return Affinity(weight, diagonal, first, second, low, high, start, value)
 
 
 @njit(cache=True)
