@@ -31,8 +31,8 @@ def test_rows_have_ratios_only_with_a_peer():
 @pytest.mark.skipif(not STATUS.exists(), reason="the operating system does not tell a process's peak memory")
 def test_a_quadratic_affinity_shows_in_memory():
     """In processes of their own: in this one, memory freed by other tests would hide what a solve takes."""
-    rrwm, reid = add_memory([{"what": "rrwm", "n": 50}, {"what": "reid", "n": 50}])
-    assert rrwm["memory_mib"] > reid["memory_mib"] + 5
+    clipper, reid = add_memory([{"what": "clipper", "n": 50}, {"what": "reid", "n": 50}])
+    assert clipper["memory_mib"] > reid["memory_mib"] + 5
 
 
 @pytest.mark.skipif(not STATUS.exists(), reason="the operating system does not tell a process's peak memory")
