@@ -22,6 +22,9 @@ from .pose import Array, RelativePose
 HALF_RANGE_QUANTILE = 0.85
 OCCLUDER = 0.022
 OCCLUDED = 0.75
+RIGHT_ANGLE_STD_RAD = math.radians(2.0)
+"""How far the headings of robots on streets or in buildings differ from a multiple of a right angle."""
+
 LEAST_HYPOTHESIS = 0.01
 ALTERNATIVES: tuple[tuple[float, float], ...] = ((0.2, 0.0), (4.0, 0.0), (1.0, 0.07))
 """Factor on all variances, and prior deviation of the robots' depth scales, tried where the reported ones fit badly."""
@@ -30,7 +33,7 @@ OTHER_SCALE_PROBABILITY = 0.02
 DOUBTFUL = -1.0
 """Log evidence below which wrong variances and scales are considered."""
 
-REPORTED_EXTENT = 0.54
+REPORTED_EXTENT = 0.7
 """Factor on `extent` for cameras that report full covariances: these know of part of it."""
 
 
@@ -42,10 +45,11 @@ def bayes(
     rng: np.random.Generator | None = None,
     min_score: float | None = None,
     common_probability: float = 0.5,
+    right_angles: float = 0.0,
     bearing_std_rad: float = DEFAULT_BEARING_STD_RAD,
     class_sharpness: float = 2.25,
     mislabel: float = 0.01,
-    extent: float = 0.013,
+    extent: float = 0.01,
     depth_offset: float = 0.035,
     depth_offset_std: float = 0.015,
     scale_std: float = 0.0,
@@ -69,6 +73,8 @@ def bayes(
             the F1 pooled over many pairs: by default the `min_score` of the pair's
             entry in `bayes_calibration.CALIBRATIONS`, between .21 and .43.
         common_probability: prior probability that two views show any common object; not used with a prior pose.
+        right_angles: prior probability that the robots' headings differ by a multiple of a right angle, as on streets
+            and in buildings; else all headings are equally likely. Not used with a prior pose or without gravity.
         bearing_std_rad: error across the viewing ray of graphs without full covariances, radians.
         class_sharpness: power that turns class confidences into likelihoods.
         mislabel: share of class labels that tell nothing.
@@ -92,7 +98,7 @@ def bayes(
     Raises:
         ValueError: graphs of different classes, or an option out of its range.
     """
-    _check_options(min_score, common_probability, screened, refined)
+    _check_options(min_score, common_probability, right_angles, screened, refined)
     check_comparable(source, target, prior)
     n, m = len(source), len(target)
     if n == 0 or m == 0:
@@ -120,6 +126,8 @@ def bayes(
             gravity,
             source.intrinsics is not None and target.intrinsics is not None,
             seen,
+            view_a.planes,
+            view_b.planes,
             q._replace(scale_std=depth_scale_std),
         )
         solve = solve_levelled if gravity else solve_spatial
@@ -133,6 +141,8 @@ def bayes(
     evidence = Evidence(np.concatenate([_features(*x) for x in explanations]), pair_features(problem))
     modes = _joined([y for _, y in explanations]) if len(explanations) > 1 else found
     modes = modes._replace(log_evidence=calibrated(evidence, calibration))
+    if right_angles > 0 and gravity and prior is None:
+        modes = modes._replace(log_evidence=modes.log_evidence + heading_log_prior(modes.R, right_angles))
     if prior is None:
         weights, P = mix(modes, math.log(common_probability), math.log1p(-common_probability), n, m)
     else:
@@ -158,11 +168,23 @@ def bayes(
     )
 
 
-def _check_options(min_score: float | None, common_probability: float, screened: int, refined: int) -> None:
+def heading_log_prior(R: Array, right_angles: float) -> Array:
+    """Log prior (k,) of levelled rotations R (k, 3, 3) about z against a uniform one; `right_angles` as in `bayes`."""
+    yaw = np.arctan2(R[:, 1, 0], R[:, 0, 0])
+    off = ((yaw + math.pi / 4) % (math.pi / 2) - math.pi / 4) / RIGHT_ANGLE_STD_RAD
+    peak = math.pi / 2 / (RIGHT_ANGLE_STD_RAD * math.sqrt(2 * math.pi))
+    return np.log(1 - right_angles + right_angles * peak * np.exp(-0.5 * off**2))
+
+
+def _check_options(
+    min_score: float | None, common_probability: float, right_angles: float, screened: int, refined: int
+) -> None:
     if min_score is not None and not 0.0 <= min_score <= 1.0:
         raise ValueError(f"min_score must lie in [0, 1], got {min_score}")
     if not 0.0 < common_probability < 1.0:
         raise ValueError(f"common_probability must lie in (0, 1), got {common_probability}")
+    if not 0.0 <= right_angles < 1.0:
+        raise ValueError(f"right_angles must lie in [0, 1), got {right_angles}")
     if screened < 1 or refined < 1:
         raise ValueError(f"screened and refined must be at least 1, got {screened} and {refined}")
 

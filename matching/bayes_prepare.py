@@ -14,6 +14,9 @@ Indices = NDArray[np.int64]
 
 LOG_2PI = float(np.log(2 * np.pi))
 
+CUT_OFF = 2.0
+"""Half of an object's length, in near-face offsets: nearer to the border of an image, part of it may be missing."""
+
 
 @njit(cache=True)
 def levelling_rotation(up: Array) -> Array:
@@ -395,9 +398,15 @@ def prepare(
     gravity: bool,
     cameras: bool,
     seen: bool,
+    planes_a: Array,
+    planes_b: Array,
     q: Settings,
 ) -> Problem:
-    """Assemble the problem. `cameras`: detections come from images: biased depth, objects of some extent."""
+    """Assemble the problem.
+
+    `cameras`: detections come from images: biased depth, objects of some extent, cut off at the `planes` (2, 3) that
+    bound the field of view (inward normals, levelled; (0, 3) = unknown).
+    """
     n, m = len(positions_a), len(positions_b)
     p_a, S_a, p_b, S_b = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((m, 3)), np.empty((m, 3, 3))
     level(positions_a, depth_a, covariances_a, bearing_variance, L_a, p_a, S_a)
@@ -407,6 +416,9 @@ def prepare(
     if cameras:
         allow_for_extent(p_a, S_a, q.extent * median_range, q.depth_offset * median_range)
         allow_for_extent(p_b, S_b, q.extent * median_range, q.depth_offset * median_range)
+        if len(covariances_a) == 0 and len(covariances_b) == 0:
+            allow_for_border(p_a, S_a, planes_a, CUT_OFF * q.depth_offset * median_range)
+            allow_for_border(p_b, S_b, planes_b, CUT_OFF * q.depth_offset * median_range)
     likely = np.full((n + 1, m + 1), -1e9)
     attributes = np.zeros((n, m))
     top_a, top_b = np.zeros(n, np.int64), np.zeros(m, np.int64)
@@ -477,3 +489,18 @@ def allow_for_extent(p: Array, S: Array, extent: float, offset: float) -> None:
         for a in range(3):
             p[i, a] *= 1.0 + offset / r
             S[i, a, a] += extent * extent * (16.0 if a == 2 else 1.0)
+
+
+@njit(cache=True)
+def allow_for_border(p: Array, S: Array, planes: Array, reach: float) -> None:
+    """Widen detections nearer than `reach` (m) to the border of the view: what lies beyond it is missing.
+
+    The middle of what is left lies up to `reach` less its own distance from the border inside of the object's.
+    """
+    for k in range(len(planes)):
+        for i in range(len(p)):
+            inside = planes[k, 0] * p[i, 0] + planes[k, 1] * p[i, 1] + planes[k, 2] * p[i, 2]
+            beyond = max(reach - max(inside, 0.0), 0.0)
+            for a in range(3):
+                for b in range(3):
+                    S[i, a, b] += beyond * beyond * planes[k, a] * planes[k, b]

@@ -9,10 +9,18 @@ import numpy as np
 import pytest
 
 from covis.matching import ObjectGraph, RelativePose, bayes
+from covis.matching.bayes import heading_log_prior
 from covis.matching.bayes_assignment import assignment_marginals
 from covis.matching.bayes_calibration import CALIBRATIONS, FEW, Evidence, calibrated, kind_of, pair_features
 from covis.matching.bayes_overlap import MARGIN_RAD, N_FEATURES, REACH, overlap_features
-from covis.matching.bayes_prepare import Settings, class_evidence, height_correction, levelling_rotation, prepare
+from covis.matching.bayes_prepare import (
+    Settings,
+    allow_for_border,
+    class_evidence,
+    height_correction,
+    levelling_rotation,
+    prepare,
+)
 from covis.matching.metrics import count, expected_calibration_error, is_correct, pooled
 from covis.matching.pose import invert
 
@@ -298,7 +306,64 @@ def test_a_camera_that_looks_away_sees_nothing_in_common():
     np.testing.assert_allclose(both.pose.T_source_target[:3, :3], np.eye(3), atol=0.05)
 
 
-@pytest.mark.parametrize("option", [{"min_score": 1.5}, {"common_probability": 0.0}, {"screened": 0}, {"refined": 0}])
+def test_an_object_cut_off_by_the_border_of_an_image_is_matched():
+    """Of an object at the border only a part is seen, whose middle lies further inside; elsewhere that is too far."""
+    rng = np.random.default_rng(21)
+    R_camera = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    K = np.array([[320.0, 0, 320], [0, 320, 240], [0, 0, 1]])
+    others = np.c_[rng.uniform(20, 60, 7), rng.uniform(-15, 15, 7), np.full(7, -1.0)]
+
+    def view(X):
+        return graph(X @ R_camera, R_camera.T @ UP, position_variance=0.02, intrinsics=K, image_size=(640, 480))
+
+    for near, matched in (([6.0, -7.8, -1.0], True), ([6.0, 0.0, -1.0], False)):
+        seen_there = view(np.r_[[near], others] + [0.0, 8.0, 0.0])
+        seen_here = view(np.r_[[np.add(near, [2.0, 2.0, 0.0])], others])
+        pairs = bayes(seen_here, seen_there, extent=0.005).pairs.tolist()
+        assert ([0, 0] in pairs) == matched
+        assert all([i, i] in pairs for i in range(1, 8))
+
+
+def test_border_of_the_view_widens_only_what_is_near_it_and_only_across_the_border():
+    planes = np.array([[0.0, 1.0, 0.0]])
+    p = np.array([[5.0, 0.5, 0.0], [5.0, -0.3, 0.0], [5.0, 2.0, 0.0]])
+    S = np.tile(np.eye(3), (3, 1, 1))
+    allow_for_border(p, S, planes, 1.5)
+    np.testing.assert_allclose(S[:, 1, 1], [1 + 1.0**2, 1 + 1.5**2, 1.0])
+    np.testing.assert_allclose(S[:, [0, 2], [0, 2]], 1.0)
+
+
+def test_prior_of_the_headings():
+    yaw = np.linspace(-np.pi, np.pi, 20001)[:-1]
+    R = np.array([rotation_z(y) for y in yaw])
+    log_prior = heading_log_prior(R, 0.3)
+    np.testing.assert_allclose(np.exp(log_prior).mean(), 1.0, atol=1e-3)
+    np.testing.assert_allclose(heading_log_prior(R, 0.0), 0.0)
+    right = heading_log_prior(np.array([rotation_z(k * np.pi / 2) for k in range(4)]), 0.3)
+    np.testing.assert_allclose(right, log_prior.max(), atol=1e-3)
+    np.testing.assert_allclose(log_prior.min(), np.log(0.7))
+
+
+def test_robots_on_a_grid_of_streets_prefer_headings_at_right_angles():
+    (a, _, _), (b, _, _) = scene(np.random.default_rng(9), common=4, alone=7, noise=0.05)
+    plain, streets = bayes(a, b, max_hypotheses=50), bayes(a, b, max_hypotheses=50, right_angles=0.5)
+
+    def off(h):
+        T = h.pose.T_source_target
+        return abs((np.arctan2(T[1, 0], T[0, 0]) + np.pi / 4) % (np.pi / 2) - np.pi / 4)
+
+    def expected(matching):
+        return sum(h.probability * off(h) for h in matching.hypotheses) / sum(
+            h.probability for h in matching.hypotheses
+        )
+
+    assert expected(streets) < expected(plain)
+
+
+@pytest.mark.parametrize(
+    "option",
+    [{"min_score": 1.5}, {"common_probability": 0.0}, {"right_angles": 1.0}, {"screened": 0}, {"refined": 0}],
+)
 def test_bad_options_raise(option):
     with pytest.raises(ValueError, match=next(iter(option))):
         bayes(graph(CLOUD), graph(CLOUD), **option)
@@ -431,11 +496,11 @@ def test_pair_features():
 
     def features(a, b):
         q = Settings(2.25, 0.01, 4.0, 3.0, 0.8, 1.2, 1.5, 0.013, 0.035, 0.015, 0.0, 0.04)
-        none = np.empty((0, 3, 3))
+        none, unbounded = np.empty((0, 3, 3)), np.empty((0, 3))
         sides = [
             (g.positions, g.position_variance, none, g.attributes, g.attribute_variance, np.eye(3)) for g in (a, b)
         ]
-        return pair_features(prepare(*sides[0], *sides[1], 0.007**2, True, False, False, q))
+        return pair_features(prepare(*sides[0], *sides[1], 0.007**2, True, False, False, unbounded, unbounded, q))
 
     known, swapped = features(a, b), features(b, a)
     np.testing.assert_allclose(known, swapped, atol=1e-9)
