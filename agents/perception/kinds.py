@@ -26,6 +26,7 @@ class Kind:
         build: the network of such params; it keeps them as `params`.
         losses: `(network, batch, weights, generator, *, bf16) -> {part: loss}`, their sum as `total`.
         perceptor: eyes with such a network.
+        learning_rate: of AdamW, at its highest.
         masks: training needs whole masks in its batches.
     """
 
@@ -33,6 +34,7 @@ class Kind:
     build: Callable[[Any], nn.Module]
     losses: Callable[..., dict[str, Tensor]]
     perceptor: type[LearnedPerception]
+    learning_rate: float
     masks: bool = False
 
 
@@ -44,7 +46,7 @@ def kind(name: str) -> Kind:
         ImportError: `maskrcnn` without torchvision.
     """
     if name == "compact":
-        return Kind(lambda d: NetworkParams.from_dict(dict(d)), Eyes, losses, LearnedPerception)
+        return Kind(lambda d: NetworkParams.from_dict(dict(d)), Eyes, losses, LearnedPerception, 1.5e-3)
     if name == "maskrcnn":
         try:
             from . import maskrcnn
@@ -55,6 +57,7 @@ def kind(name: str) -> Kind:
             maskrcnn.PaperNetwork,
             maskrcnn.losses,
             maskrcnn.MaskRCNNPerception,
+            3e-4,
             masks=True,
         )
     raise ValueError(f"no network is called {name!r}; there are compact, maskrcnn")

@@ -35,7 +35,7 @@ class TrainingParams:
         meet_every: steps between two averagings of the workers' weights.
         pool_chunks: chunks of frames kept at hand, by each worker.
         steps_per_chunk: how often the oldest chunk is replaced by a new one.
-        learning_rate: at its highest.
+        learning_rate: at its highest; None = that of the network, see `kinds.Kind`.
         warm_up: share of the training over which it rises.
         weight_decay: of AdamW.
         average: decay of the running mean of the weights, which is what ships.
@@ -54,7 +54,7 @@ class TrainingParams:
     meet_every: int = 16
     pool_chunks: int = 60
     steps_per_chunk: int = 3
-    learning_rate: float = 1.5e-3
+    learning_rate: float | None = None
     warm_up: float = 0.04
     weight_decay: float = 0.02
     average: float = 0.998
@@ -151,7 +151,7 @@ def train_step(state: State, pool: Pool, params: TrainingParams, done: float, wo
     learner = kind(params.network)
     batch = make_batch(chosen, rng, masks=learner.masks)
     for group in state.optimiser.param_groups:
-        group["lr"] = params.learning_rate * schedule(done, params.warm_up)
+        group["lr"] = (params.learning_rate or learner.learning_rate) * schedule(done, params.warm_up)
     state.optimiser.zero_grad(set_to_none=True)
     parts = learner.losses(state.network, batch, params.weights, generator, bf16=params.bf16)
     parts["total"].backward()
@@ -182,7 +182,7 @@ def _optimiser(network: nn.Module, params: TrainingParams) -> torch.optim.Optimi
     decayed = [p for p in network.parameters() if p.ndim > 1]
     plain = [p for p in network.parameters() if p.ndim <= 1]
     groups = [{"params": decayed, "weight_decay": params.weight_decay}, {"params": plain, "weight_decay": 0.0}]
-    return torch.optim.AdamW(groups, lr=params.learning_rate, betas=(0.9, 0.99), fused=True)
+    return torch.optim.AdamW(groups, betas=(0.9, 0.99), fused=True)
 
 
 @torch.no_grad()
