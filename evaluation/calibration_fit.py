@@ -31,7 +31,7 @@ GENERATED = "synthetic-"
 LEAST = 1e-3
 """Probabilities closer to 0 or 1 count as so close, so that one error of a certain match does not decide a fit."""
 RIDGE = 1e-4
-"""Of the weights, in nats a pair: weights that the pairs say nothing of stay near 0."""
+"""Penalty on half the squared weights, nats a pair: weights that the pairs say nothing of stay near 0."""
 LEAST_SCORE = 0.05
 """Of the matches that are read off; no threshold is below."""
 
@@ -202,12 +202,13 @@ def emitted(pairs: Sequence[PairEvidence], calibration: Calibration) -> tuple[Ar
     return np.concatenate(scores), np.concatenate(right), common
 
 
-def fit(pairs: Sequence[PairEvidence], weights: Mapping[str, float] | None = None) -> Calibration:
+def fit(pairs: Sequence[PairEvidence], weights: Mapping[str, float] | None = None, ridge: float = RIDGE) -> Calibration:
     """The calibration of least log score over all possible matches, its threshold half the F1 that it reaches.
 
     Args:
         pairs: evidence beside the truth.
         weights: how much a pair of a target counts; 1 where none is named.
+        ridge: penalty on half the squared weights, nats a pair.
 
     Raises:
         ValueError: no pairs.
@@ -224,7 +225,7 @@ def fit(pairs: Sequence[PairEvidence], weights: Mapping[str, float] | None = Non
     def penalised(values: Array) -> tuple[float, Array]:
         theta[free] = values
         value, gradient = objective(theta, x)
-        return value + 0.5 * RIDGE * float(values @ values), gradient[free] + RIDGE * values
+        return value + 0.5 * ridge * float(values @ values), gradient[free] + ridge * values
 
     theta[free] = minimize(penalised, theta[free], jac=True, method="L-BFGS-B", options={"maxiter": 1000}).x
     fitted = Calibration(theta[:f].copy(), theta[f : f + g].copy(), theta[f + g :].copy(), 0.0)
@@ -286,7 +287,12 @@ class Refit:
 
 
 def refit(
-    kind: str, collected: Sequence[PairEvidence], weights: Mapping[str, float] | None = None, seed: int = 0
+    kind: str,
+    collected: Sequence[PairEvidence],
+    weights: Mapping[str, float] | None = None,
+    *,
+    ridge: float = RIDGE,
+    seed: int = 0,
 ) -> Refit:
     """Fit a calibration to all pairs that it is for, and to halves of them.
 
@@ -294,6 +300,7 @@ def refit(
         kind: entry of CALIBRATIONS.
         collected: of `collect`.
         weights: as for `fit`; names may be patterns such as "synthetic-*".
+        ridge: as for `fit`.
         seed: of the halves.
 
     Raises:
@@ -304,10 +311,10 @@ def refit(
         raise ValueError(f"no pair of views is of the kind {kind!r}; there are {sorted({p.kind for p in collected})}")
     targets = _by_target(pairs)
     weights = _spelt_out(weights or {}, list(targets))
-    fitted, parts = fit(pairs, weights), halves(pairs, seed)
+    fitted, parts = fit(pairs, weights, ridge), halves(pairs, seed)
     compared = {"whole": [(pairs, CALIBRATIONS["whole"])], "held": [(pairs, CALIBRATIONS[kind])]}
     compared |= {"fitted": [(pairs, fitted)]}
-    compared |= {"halves": [(parts[1 - i], fit(parts[i], weights)) for i in (0, 1)]} if all(parts) else {}
+    compared |= {"halves": [(parts[1 - i], fit(parts[i], weights, ridge)) for i in (0, 1)]} if all(parts) else {}
     rows: list[dict[str, Any]] = []
     for target, own in targets.items():
         row: dict[str, Any] = {"target": target, "pairs": len(own)}

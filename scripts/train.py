@@ -128,6 +128,7 @@ def calibration(
     frames: Annotated[
         int | None, typer.Option(help="At most so many of each, evenly spread; of generated ones so many, else 100.")
     ] = None,
+    ridge: Annotated[float, typer.Option(help="Penalty on the weights, nats a pair: for few episodes, more.")] = 1e-4,
     seed: Annotated[int, typer.Option(help="Of shuffling, generated pairs and halves.")] = 0,
     json_target: Annotated[str | None, typer.Option("--json", help="Write weights and rows to FILE.")] = None,
 ) -> None:
@@ -141,13 +142,15 @@ def calibration(
     try:
         if kind not in fittable():
             raise ValueError(f"no weights are kept for {kind!r}; there are {', '.join(fittable())}")
+        if not ridge >= 0:
+            raise ValueError(f"--ridge must not be negative, got {ridge}")
         require_writable(json_target)
         weights = _weights(weight or [])
         pairs = []
         for target in targets:
             with progress_bar(f"evidence of {Path(target).name}") as progress:
                 pairs += collect(target, kind, frames=frames, seed=seed, progress=progress)
-        found = refit(kind, pairs, weights, seed)
+        found = refit(kind, pairs, weights, ridge=ridge, seed=seed)
     except (ValueError, RuntimeError, OSError) as error:
         fail(error)
     fitted = {
@@ -155,7 +158,15 @@ def calibration(
         for name, value in found.fitted._asdict().items()
     }
     if json_target is not None:
-        content = {"kind": kind, **fitted, "weights": weights, "seed": seed, "bound": found.bound, "rows": found.rows}
+        content = {
+            "kind": kind,
+            **fitted,
+            "weights": weights,
+            "ridge": ridge,
+            "seed": seed,
+            "bound": found.bound,
+            "rows": found.rows,
+        }
         Path(json_target).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     console.print(_comparison(found.rows))
     for name, value in fitted.items():
