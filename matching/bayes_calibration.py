@@ -1,7 +1,7 @@
 """How far evidence is to be trusted: what a match says, and what chance would explain as well.
 
 A wrong pose often explains two views better than the true one, and errors that the model takes for independent are not.
-So a mode's evidence is damped, the more the less a single match says; the weights were fitted (see the docs).
+So a mode's evidence is damped, the more the less a single match says; `covis train calibration` fits the weights.
 """
 
 from __future__ import annotations
@@ -56,10 +56,10 @@ CALIBRATIONS = {
     ),
     # Cameras that report full covariances: one network's errors in one image go together.
     "eyes": Calibration(
-        np.array([0.284, 0.448, 0.0, 0.0, 0.0, 0.0, 2.242, -1.617]),
-        np.array([0.0, -0.08, -0.99, 0.61, 0.05]),
-        np.array([-0.57, -0.08, 0.12, 1.52, -1.69]),
-        0.28,
+        np.array([0.336, 0.353, -0.041, -0.017, -0.168, -0.338, 1.663, -1.092]),
+        np.array([0.0, -0.009, -0.927, 0.404, -0.145]),
+        np.array([-0.038, -0.2, 0.359, 1.622, -1.57]),
+        0.26,
     ),
     # Known fields of view without images, and more than FEW objects: some of them hide.
     "fields": Calibration(
