@@ -101,6 +101,8 @@ def residual_edges(
     temper: float,
     bonus_a: Array,
     bonus_b: Array,
+    shared_a: Array,
+    shared_b: Array,
     min_log_weight: float,
     rows: Array,
     cols: Array,
@@ -111,7 +113,8 @@ def residual_edges(
 ) -> int:
     """Possible matches under a pose, row by row; returns how many.
 
-    Fills rows, cols, log_weights, residuals (k, 3) = source - mapped target, weights (k, 6) the
+    Parts of log weights: bonus_a (n,) and bonus_b (m,) of every match, shared_a and shared_b of those in which neither
+    object is the robot itself, which is the last of either side. Fills rows, cols, log_weights, residuals (k, 3) = source - mapped target, weights (k, 6) the
     inverse covariance (xx, yy, zz, xy, xz, yz) and mapped (m, 3), the rotated (not shifted) target positions.
     """
     n, m, nb = len(p_a), len(p_b), len(bias)
@@ -167,6 +170,8 @@ def residual_edges(
             if chi2 > max_chi2:
                 continue
             w = bonus_a[i] + bonus_b[j] + static[i, j] - 0.5 * (chi2 + np.log(det)) - 1.5 * LOG_2PI
+            if i < n - 1 and j < m - 1:
+                w += shared_a[i] + shared_b[j]
             if w < min_log_weight:
                 continue
             rows[e], cols[e], log_weights[e] = i, j, w
@@ -268,12 +273,16 @@ def view_bonus(
     log_bonus: float,
     bonus_a: Array,
     bonus_b: Array,
+    shared_a: Array,
+    shared_b: Array,
 ) -> float:
-    """What both fields of view say under a pose: parts of every match's log weight, and what stays when none is made.
+    """What both fields of view say under a pose: parts of log weights (see `residual_edges`), and what stays when no
+    match is made.
 
     An object of the source that the target detects with probability d counts 1 - d when it stays alone; a match has
     sqrt(d e) instead. The Poisson void term is the expected number of common objects. The last object of either side is
-    the robot itself, which is known to be there.
+    the robot itself, which is known to be there: a match with it depends on whether it is detected, and takes nothing
+    of the other object but "stays alone".
     """
     n, m = len(p_a), len(p_b)
     total = 0.0
@@ -291,7 +300,8 @@ def view_bonus(
             bonus_a[i] = np.log(d) - alone
             total += alone
         else:
-            bonus_a[i] = 0.5 * (np.log(d) + log_bonus) - alone
+            bonus_a[i] = -alone
+            shared_a[i] = 0.5 * (np.log(d) + log_bonus)
             total += alone + 0.5 * d
     for j in range(m):
         x, y, z = p_b[j, 0], p_b[j, 1], p_b[j, 2]
@@ -307,9 +317,9 @@ def view_bonus(
             bonus_b[j] = np.log(d) - alone
             total += alone
         else:
-            bonus_b[j] = 0.5 * (np.log(d) + log_bonus) - alone
+            bonus_b[j] = -alone
+            shared_b[j] = 0.5 * (np.log(d) + log_bonus)
             total += alone + 0.5 * d
-    # A robot that was matched replaces nothing of its partner but "stays alone".
     return total
 
 
@@ -355,14 +365,12 @@ def refine(
     # The last object of either side is the robot itself.
     n0, m0 = n - 1, m - 1
     seen = view_a.known > 0 and view_b.known > 0
-    bonus_a, bonus_b = np.empty(n), np.empty(m)
+    bonus_a, bonus_b, shared_a, shared_b = np.zeros(n), np.zeros(m), np.zeros(n), np.zeros(m)
     for iteration in range(max_iterations + 1):
         void = 0.0
-        bonus_a[:] = log_odds
-        bonus_b[:] = 0.0
-        bonus_a[n0], bonus_b[m0] = 0.0, -log_odds
+        shared_a[:] = log_odds
         if seen:
-            void = view_bonus(p_a, p_b, R, t, view_a, view_b, q.view_bonus, bonus_a, bonus_b)
+            void = view_bonus(p_a, p_b, R, t, view_a, view_b, q.view_bonus, bonus_a, bonus_b, shared_a, shared_b)
         temper = tempers[min(iteration, len(tempers) - 1)]
         n_edges = residual_edges(
             p_a,
@@ -378,6 +386,8 @@ def refine(
             temper,
             bonus_a,
             bonus_b,
+            shared_a,
+            shared_b,
             -6.0,
             rows,
             cols,
@@ -472,7 +482,7 @@ def screen_spatial(
 ) -> None:
     """Score poses in SE(3), like `screen`: the smaller of the two robots' sums of best positive log weights."""
     n, m = static.shape
-    bonus_a, bonus_b = np.full(n, log_odds), np.zeros(m)
+    bonus_a, bonus_b, shared_a, shared_b = np.zeros(n), np.zeros(m), np.full(n, log_odds), np.zeros(m)
     none_a, none_b, no_bias = np.zeros((n, 0, 3)), np.zeros((m, 0, 3)), np.zeros(0)
     rows, cols, logs = np.empty(n * m, np.int64), np.empty(n * m, np.int64), np.empty(n * m)
     residuals, weights, mapped = np.empty((n * m, 3)), np.empty((n * m, 6)), np.empty((m, 3))
@@ -491,6 +501,8 @@ def screen_spatial(
             temper,
             bonus_a,
             bonus_b,
+            shared_a,
+            shared_b,
             0.0,
             rows,
             cols,
