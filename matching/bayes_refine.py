@@ -114,8 +114,10 @@ def residual_edges(
     """Possible matches under a pose, row by row; returns how many.
 
     Parts of log weights: bonus_a (n,) and bonus_b (m,) of every match, shared_a and shared_b of those in which neither
-    object is the robot itself, which is the last of either side. Fills rows, cols, log_weights, residuals (k, 3) = source - mapped target, weights (k, 6) the
-    inverse covariance (xx, yy, zz, xy, xz, yz) and mapped (m, 3), the rotated (not shifted) target positions.
+    object is the robot itself, which is the last of either side.
+
+    Fills rows, cols, log_weights, residuals (k, 3) = source - mapped target, weights (k, 6) the inverse covariance
+    (xx, yy, zz, xy, xz, yz) and mapped (m, 3), the rotated (not shifted) target positions.
     """
     n, m, nb = len(p_a), len(p_b), len(bias)
     S = np.empty((m, 6))
@@ -263,63 +265,42 @@ def overlap_log_odds(k: float, n: int, m: int, q: Settings) -> float:
 
 
 @njit(cache=True)
-def view_bonus(
-    p_a: Array,
-    p_b: Array,
+def seen_by_other(
+    p: Array,
     R: Array,
     t: Array,
-    view_a: View,
-    view_b: View,
+    view: View,
+    detections: Array,
     log_bonus: float,
-    bonus_a: Array,
-    bonus_b: Array,
-    shared_a: Array,
-    shared_b: Array,
+    bonus: Array,
+    shared: Array,
 ) -> float:
-    """What both fields of view say under a pose: parts of log weights (see `residual_edges`), and what stays when no
-    match is made.
+    """What the other robot's field of view says of objects p (n, 3), which R and t bring into its frame.
 
-    An object of the source that the target detects with probability d counts 1 - d when it stays alone; a match has
-    sqrt(d e) instead. The Poisson void term is the expected number of common objects. The last object of either side is
-    the robot itself, which is known to be there: a match with it depends on whether it is detected, and takes nothing
-    of the other object but "stays alone".
+    An object that it detects with probability d counts 1 - d when it stays alone; a match has sqrt(d e) instead, where
+    e is the partner's. The Poisson void term is the expected number of common objects, half of it from either side. The
+    last object is the robot itself, which is known to be there: a match with it depends on whether it is detected, and
+    takes nothing of the other object but "stays alone". Fills parts of log weights, `bonus` and `shared` (n,), for
+    `residual_edges`; returns what stays when no match is made.
     """
-    n, m = len(p_a), len(p_b)
+    n = len(p)
     total = 0.0
     for i in range(n):
-        x, y, z = p_a[i, 0] - t[0], p_a[i, 1] - t[1], p_a[i, 2] - t[2]
-        d = detection_probability(
-            R[0, 0] * x + R[1, 0] * y + R[2, 0] * z,
-            R[0, 1] * x + R[1, 1] * y + R[2, 1] * z,
-            R[0, 2] * x + R[1, 2] * y + R[2, 2] * z,
-            view_b,
-            p_b,
-        )
-        alone = np.log(1.0 - d)
-        if i == n - 1:
-            bonus_a[i] = np.log(d) - alone
-            total += alone
-        else:
-            bonus_a[i] = -alone
-            shared_a[i] = 0.5 * (np.log(d) + log_bonus)
-            total += alone + 0.5 * d
-    for j in range(m):
-        x, y, z = p_b[j, 0], p_b[j, 1], p_b[j, 2]
+        x, y, z = p[i, 0], p[i, 1], p[i, 2]
         d = detection_probability(
             R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0],
             R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1],
             R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2],
-            view_a,
-            p_a,
+            view,
+            detections,
         )
-        alone = np.log(1.0 - d)
-        if j == m - 1:
-            bonus_b[j] = np.log(d) - alone
-            total += alone
+        if i == n - 1:
+            bonus[i] = np.log(d) - np.log(1.0 - d)
+            total += np.log(1.0 - d)
         else:
-            bonus_b[j] = -alone
-            shared_b[j] = 0.5 * (np.log(d) + log_bonus)
-            total += alone + 0.5 * d
+            bonus[i] = -np.log(1.0 - d)
+            shared[i] = 0.5 * (np.log(d) + log_bonus)
+            total += np.log(1.0 - d) + 0.5 * d
     return total
 
 
@@ -370,7 +351,9 @@ def refine(
         void = 0.0
         shared_a[:] = log_odds
         if seen:
-            void = view_bonus(p_a, p_b, R, t, view_a, view_b, q.view_bonus, bonus_a, bonus_b, shared_a, shared_b)
+            R_inverse = np.ascontiguousarray(R.T)
+            void = seen_by_other(p_a, R_inverse, -(R_inverse @ t), view_b, p_b, q.view_bonus, bonus_a, shared_a)
+            void += seen_by_other(p_b, R, t, view_a, p_a, q.view_bonus, bonus_b, shared_b)
         temper = tempers[min(iteration, len(tempers) - 1)]
         n_edges = residual_edges(
             p_a,

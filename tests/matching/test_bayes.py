@@ -21,6 +21,8 @@ from covis.matching.bayes_prepare import (
     levelling_rotation,
     prepare,
 )
+from covis.matching.bayes_refine import residual_edges, seen_by_other
+from covis.matching.bayes_view import View, detection_probability
 from covis.matching.metrics import count, expected_calibration_error, is_correct, pooled
 from covis.matching.pose import invert
 
@@ -555,3 +557,37 @@ def test_default_threshold():
         default = bayes(one, two, prior=known)
         assert default.diagnostics["calibration"] == kind
         np.testing.assert_array_equal(default.pairs, bayes(one, two, prior=known, min_score=least).pairs)
+
+
+def test_a_detection_that_is_the_other_robot_is_no_common_object():
+    """Its log weight has the robot's odds of being detected and what staying alone would cost it, nothing shared."""
+    log_bonus = 1.2
+    planes = np.array([[0.6, 0.8, 0.0], [0.6, -0.8, 0.0]])  # looks along x
+    view = View(1.0, planes, 500.0, 0.75, 0.0, 1.0)
+    detected = np.array([[10.0, 0.0, 0.0], [10.0, 30.0, 0.0], [0.0, 0.0, 0.0]])  # in view, out of view, the robot
+    in_front = np.eye(3), np.array([5.0, 0.0, 0.0])
+    behind = np.eye(3), np.array([-5.0, 0.0, 0.0])
+
+    near, robot = (detection_probability(x, 0.0, 0.0, view, detected[:0]) for x in (15.0, 5.0))
+    assert 0.74 < near <= robot < 0.75
+    bonus, shared = np.zeros(3), np.zeros(3)
+    void = seen_by_other(detected, *in_front, view, detected[:0], log_bonus, bonus, shared)
+    assert bonus == pytest.approx([-np.log(1 - near), -np.log(0.99), np.log(robot / (1 - robot))])
+    assert shared == pytest.approx([0.5 * (np.log(near) + log_bonus), 0.5 * (np.log(0.01) + log_bonus), 0])
+    assert void == pytest.approx(np.log((1 - near) * 0.99 * (1 - robot)) + 0.5 * (near + 0.01))
+    seen_by_other(detected, *behind, view, detected[:0], log_bonus, bonus, shared)
+    assert bonus[2] < -4
+
+    # Two views of one object each: what an ordinary match gets more than one with the robot is what is shared.
+    p, S = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]), np.stack([np.eye(3)] * 2)
+    none, no_bias = np.zeros((2, 0, 3)), np.zeros(0)
+    rows, cols, logs = np.zeros(4, np.int64), np.zeros(4, np.int64), np.zeros(4)
+    spare = np.zeros((4, 3)), np.zeros((4, 6)), np.zeros((2, 3))
+    shared_a, shared_b = np.array([0.3, 0.0]), np.array([0.4, 0.0])
+    count = residual_edges(
+        *(p, S, none, p, S, none, np.zeros((2, 2)), np.eye(3), np.zeros(3), no_bias, 1.0),
+        *(np.zeros(2), np.zeros(2), shared_a, shared_b, -50.0, rows, cols, logs, *spare),
+    )
+    weight = {(i, j): w for i, j, w in zip(rows[:count], cols[:count], logs[:count], strict=True)}
+    assert weight[0, 0] - weight[1, 1] == pytest.approx(0.7)
+    assert weight[0, 1] == weight[1, 0] == pytest.approx(weight[1, 1] - 0.25)
