@@ -1,6 +1,7 @@
 """The command line, as a person calls it."""
 
 import json
+import subprocess
 import sys
 
 import pytest
@@ -62,9 +63,13 @@ def test_mistakes_are_one_line_and_status_2(small_dataset, arguments, message):
     assert "Traceback" not in result.output
 
 
-def test_matching_imports_neither_simulators_nor_torch():
-    import subprocess
+def test_the_command_is_a_module_too(small_dataset):
+    command = [sys.executable, "-m", "covis.scripts", "check", str(small_dataset)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "frames" in done.stdout
 
+
+def test_matching_imports_neither_simulators_nor_torch():
     code = (
         "import sys, covis.matching, covis.fusion, covis.evaluation.benchmark, covis.scripts.main; "
         "print([m for m in ('torch', 'pybullet', 'highway_env', 'pettingzoo', 'gymnasium', 'cv2') if m in sys.modules])"
