@@ -5,6 +5,7 @@
 Every matcher is a function `(source, target, *, prior=None, rng=None, **options) -> Matching`.
 """
 
+from . import kernel_cache as kernel_cache  # first: the others load kernels
 from .bayes import bayes
 from .bcagm import bcagm
 from .clipper import clipper
