@@ -93,7 +93,8 @@ def bayes(
         Matches with their posterior probabilities; `pose` (None when refused) and `hypotheses` of the modes;
         `diagnostics["nothing_in_common"]`, the probability that there is nothing to match or none of the modes is
         right; `["probabilities"]` (n, m) of all matches; `["log_evidence"]` of the views given that they share objects,
-        over their evidence given that they do not.
+        over their evidence given that they do not. `["calibration"]`, `["evidence"]` and `["marginals"]` (k, n, m) of
+        the k modes are what `covis train calibration` fits weights to.
 
     Raises:
         ValueError: graphs of different classes, or an option out of its range.

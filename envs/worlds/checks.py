@@ -26,9 +26,8 @@ def check_fields(params: Any) -> None:
 
 def check_names(name: str, value: object, known: Collection[str]) -> None:
     """Raise ValueError unless a parameter is a non-empty tuple or list of names, all `known`."""
-    named = isinstance(value, tuple | list) and len(value) > 0
-    ok = named and all(isinstance(item, str) and item in known for item in value)  # type: ignore[attr-defined]
-    require(ok, name, value, f"a tuple of some of {', '.join(known)}")
+    named = isinstance(value, tuple | list) and len(value) > 0 and all(isinstance(x, str) and x in known for x in value)
+    require(named, name, value, f"a tuple of some of {', '.join(known)}")
 
 
 def _check_field(name: str, kind: str, value: object) -> None:
