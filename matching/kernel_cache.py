@@ -1,33 +1,61 @@
 """Keeps Numba's stored kernels true to the sources.
 
-Numba compiles a kernel together with those it calls, but looks only at its own file to tell whether what it stored
-still holds: after a change of one file, kernels of others would go on computing what they did before. Importing this
-module, which packages do before their kernels, deletes what is older than a source.
+Numba compiles a kernel together with those it calls, but stamps what it stores with its own file alone: after a change
+of another file it would go on computing what that one did before. Importing this module, which packages do before
+their kernels, puts a locator before Numba's own ones that adds the other sources to the stamp. Where kernels are stored
+(`NUMBA_CACHE_DIR`, beside the sources, or in the user's cache where these are read-only) stays Numba's choice, and so
+does everything about the kernels of other packages.
 """
 
 from __future__ import annotations
 
+from functools import lru_cache
+from hashlib import sha256
 from pathlib import Path
+from typing import Any
+
+from numba.core import caching
 
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("matching", "fusion", "envs", "agents")
 """Those with kernels; each calls itself and those before it."""
 
 
-def forget_stale_kernels(root: Path = ROOT) -> None:
-    """Delete stored kernels that are older than a source of their package, or of one that it calls.
-
-    Looks beside the sources, where Numba stores them unless that is read-only or NUMBA_CACHE_DIR is set.
-    """
-    changed = 0.0
-    for package in PACKAGES:
-        changed = max([changed, *(x.stat().st_mtime for x in (root / package).rglob("*.py"))])
-        for stored in (root / package).rglob("__pycache__/*.nbi"):
-            try:
-                if stored.stat().st_mtime < changed:
-                    stored.unlink()
-            except OSError:  # another process was faster, or it is not ours to delete
-                continue
+@lru_cache
+def sources_digest(package: str, root: Path = ROOT) -> bytes:
+    """SHA-256 of all sources that kernels of a package may call: its own, and those of the packages before it."""
+    digest = sha256()
+    for name in PACKAGES[: PACKAGES.index(package) + 1]:
+        for path in sorted((root / name).rglob("*.py")):
+            digest.update(f"{path.relative_to(root)}\n".encode() + path.read_bytes())
+    return digest.digest()
 
 
-forget_stale_kernels()
+class KernelLocator(caching._CacheLocator):
+    """The locator that Numba would take, with `sources_digest` in its stamp."""
+
+    def __init__(self, chosen: Any, package: str) -> None:
+        self.chosen, self.package = chosen, package
+
+    def get_cache_path(self) -> str:
+        return str(self.chosen.get_cache_path())
+
+    def get_source_stamp(self) -> tuple[Any, bytes]:
+        return self.chosen.get_source_stamp(), sources_digest(self.package)
+
+    def get_disambiguator(self) -> str:
+        return str(self.chosen.get_disambiguator())
+
+    @classmethod
+    def from_function(cls, py_func: Any, py_file: str) -> KernelLocator | None:
+        """None, which leaves the function to Numba's own locators, unless it is a kernel of these packages."""
+        top, _, rest = py_func.__module__.partition(".")
+        package = rest.partition(".")[0]
+        if top != __name__.partition(".")[0] or package not in PACKAGES:
+            return None
+        others = (other for other in caching.CacheImpl._locator_classes if other is not cls)
+        found = (other.from_function(py_func, py_file) for other in others)
+        return next((cls(chosen, package) for chosen in found if chosen is not None), None)
+
+
+caching.CacheImpl._locator_classes.insert(0, KernelLocator)

@@ -1,29 +1,67 @@
+"""A change of any source that a kernel may call makes Numba compile it anew."""
+
 import os
+import shutil
+import subprocess
+import sys
 
-from covis.matching.kernel_cache import forget_stale_kernels
+import numba
+import pytest
+
+from covis.matching import kernel_cache
+from covis.matching.kernel_cache import KernelLocator, sources_digest
+from covis.matching.pose import _rodrigues
 
 
-def test_kernels_older_than_a_source_they_may_call_are_forgotten(tmp_path):
-    matching, envs = tmp_path / "matching" / "a.py", tmp_path / "envs" / "camera" / "b.py"
-    stored = [x.parent / "__pycache__" / f"{x.stem}.kernel.nbi" for x in (matching, envs)]
+def put(path, text):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
 
-    def touch(path, at):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch()
-        os.utime(path, (at, at))
 
-    def left():
-        forget_stale_kernels(tmp_path)
-        return [x.exists() for x in stored]
+def test_digest_covers_a_package_and_those_before_it(tmp_path):
+    def digests():
+        sources_digest.cache_clear()
+        return {name: sources_digest(name, tmp_path) for name in ("matching", "envs", "agents")}
 
-    touch(matching, 10)
-    touch(envs, 20)
-    touch(stored[0], 15)
-    touch(stored[1], 25)
-    assert left() == [True, True]
-    touch(envs, 30)
-    assert left() == [True, False]
-    touch(stored[1], 40)  # compiled again
-    assert left() == [True, True]
-    touch(matching, 50)  # which the cameras may call
-    assert left() == [False, False]
+    def changed(before):
+        return {name for name, digest in digests().items() if digest != before[name]}
+
+    put(tmp_path / "matching" / "a.py", "x = 1")
+    put(tmp_path / "envs" / "camera" / "b.py", "x = 1")
+    before = digests()
+    assert not changed(before)
+    put(tmp_path / "envs" / "camera" / "b.py", "x = 2")
+    assert changed(before) == {"envs", "agents"}
+    put(tmp_path / "matching" / "a.py", "x = 2")
+    assert changed(before) == {"matching", "envs", "agents"}
+    before = digests()
+    put(tmp_path / "envs" / "c.py", "")
+    assert changed(before) == {"envs", "agents"}
+    sources_digest.cache_clear()
+
+
+@pytest.mark.skipif(numba.config.DISABLE_JIT, reason="nothing is compiled")
+def test_only_our_kernels_are_stamped():
+    assert isinstance(_rodrigues._cache._impl.locator, KernelLocator)
+    foreign = numba.njit(cache=True)(lambda x: x)
+    assert not isinstance(foreign._cache._impl.locator, KernelLocator)
+
+
+@pytest.mark.skipif(numba.config.DISABLE_JIT, reason="nothing is compiled")
+def test_a_kernel_that_calls_a_changed_one_is_compiled_anew(tmp_path):
+    package = tmp_path / "other" / "matching"
+    kernel = "from numba import njit\n@njit(cache=True)\ndef {}(x):\n    return {}\n"
+    put(package / "__init__.py", "from . import kernel_cache\n")
+    shutil.copy(kernel_cache.__file__, package)
+    put(package / "outer.py", "from .inner import inner\n" + kernel.format("outer", "inner(x)"))
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    code = "from other.matching.outer import outer as f; print(f(1), sum(f.stats.cache_hits.values()))"
+
+    def run(factor):
+        put(package / "inner.py", kernel.format("inner", f"{factor} * x"))
+        command = [sys.executable, "-B", "-c", code]
+        return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.split()
+
+    assert run(2) == ["2", "0"]
+    assert run(2) == ["2", "1"]
+    assert run(3) == ["3", "0"]
