@@ -17,13 +17,17 @@ from .records import Tally
 from .settings import SCENE_NAMES, Settings, scene_preset
 from .shards import Shards
 from .suites import Suite
+from .synthetic import PREFIX, problem_names
+
+GENERATED = tuple(PREFIX + name for name in problem_names())
+"""Targets that are generated on the spot."""
 
 
 def plan(targets: Sequence[str], methods: Sequence[Method], settings: Settings) -> list[Experiment]:
-    """One experiment per target: names of scenes, `package.module:World`, dataset folders.
+    """One experiment per target: names of scenes, `package.module:World`, generated problems, dataset folders.
 
     Raises:
-        ValueError: a target that is neither.
+        ValueError: a target that is none of them.
         MissingExtraError: a scene without the packages it needs.
     """
     texts = tuple(method.label for method in methods)
@@ -32,10 +36,14 @@ def plan(targets: Sequence[str], methods: Sequence[Method], settings: Settings) 
         if target in SCENE_NAMES or (":" in target and not Path(target).exists()):
             require_scene(settings.perception)
             experiments.append(Experiment(target, "scene", target, texts, settings, (settings.seed,)))
+        elif target in GENERATED:
+            problem = target.removeprefix(PREFIX)
+            experiments.append(Experiment(target, "synthetic", problem, texts, settings, (settings.seed,)))
         elif Path(target).is_dir():
             experiments.append(Experiment(target, "dataset", target, texts, settings, (settings.seed,)))
         else:
-            raise ValueError(f"target {target!r} is neither a dataset folder nor a scene ({', '.join(SCENE_NAMES)})")
+            known = ", ".join((*SCENE_NAMES, *GENERATED))
+            raise ValueError(f"target {target!r} is neither a dataset folder nor one of {known}")
     return experiments
 
 
@@ -54,7 +62,7 @@ def benchmark(
         ValueError: a target or setting that makes no sense.
     """
     for method in methods:
-        method.load()
+        method.check()
     return run_experiments(plan(targets, methods, settings), **how)
 
 
@@ -90,6 +98,7 @@ def run_experiments(
     resume: bool = False,
     overwrite: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    complain: Callable[[str], object] = lambda message: None,
 ) -> list[dict[str, Any]]:
     """Rows of experiments.
 
@@ -103,6 +112,8 @@ def run_experiments(
         resume: go on with the run in `out`.
         overwrite: replace the run in `out`.
         progress: called with (units done, units in all).
+        complain: called with what a method failed of, once for each method. On a pair on which it fails it counts as
+            having found nothing; rows tell how many these are (`n_failed`).
 
     Raises:
         FileExistsError: `out` holds another run, or this one and neither `resume` nor `overwrite` is on.
@@ -110,7 +121,7 @@ def run_experiments(
     """
     about = about or {"suite": None}
     for text in dict.fromkeys(text for experiment in experiments for text in experiment.methods):
-        Method.parse(text).load()
+        Method.parse(text).check()
     executor = make_executor(engine, workers, ray_address)
     units = units_of(experiments)
     session = provenance()
@@ -125,7 +136,15 @@ def run_experiments(
     noted = {"commit": session["commit"]}
     if engine == "ray":  # elsewhere the working directory is another
         units = [replace(unit, experiment=absolute(unit.experiment)) for unit in units]
-    results = run(units, executor, shards=shards, shared_folder=engine == "local", about=noted, progress=progress)
+    results = run(
+        units,
+        executor,
+        shards=shards,
+        shared_folder=engine == "local",
+        about=noted,
+        progress=progress,
+        complain=complain,
+    )
     rows, verdicts = [], []
     for experiment in experiments:
         entries = _entries(experiment, results, session["versions"])

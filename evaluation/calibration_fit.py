@@ -23,10 +23,9 @@ from ..matching.bayes_solve import decode
 from ..matching.metrics import expected_calibration_error
 from ..matching.pose import Array
 from .datasets import Frame, View, load_dataset
+from .synthetic import PREFIX, problem_names
 from .synthetic import frames as generated
-from .synthetic import problem_names
 
-GENERATED = "synthetic-"
 """Before the name of a generated problem, as in the suites."""
 LEAST = 1e-3
 """Probabilities closer to 0 or 1 count as so close, so that one error of a certain match does not decide a fit."""
@@ -87,7 +86,7 @@ def collect(
     Raises:
         DatasetError: a folder that cannot be read.
     """
-    problem = target.removeprefix(GENERATED)
+    problem = target.removeprefix(PREFIX)
     if target != problem and problem in problem_names():
         every = list(generated(problem, seed, range(100 if frames is None else frames)))
         every = [_hidden(frame) for frame in every] if kind == "unseen" else every

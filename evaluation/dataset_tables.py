@@ -98,7 +98,7 @@ def _optional(raw: dict[str, Any], key: str, convert: Callable[[Any], Any], file
         return None
     try:
         return convert(raw[key])
-    except (TypeError, ValueError, KeyError, IndexError) as error:
+    except (TypeError, ValueError, KeyError, IndexError, OverflowError) as error:
         raise DatasetError(f"{file}: {key} is malformed: {raw[key]!r} ({error})") from error
 
 
@@ -111,8 +111,8 @@ def _unit_vector(value: Any) -> Array:
 
 def _image_size(value: Any) -> tuple[int, int]:
     width, height = (int(x) for x in value)
-    if width < 1 or height < 1:
-        raise ValueError("width and height must be positive")
+    if width < 1 or height < 1 or [width, height] != list(value):
+        raise ValueError("width and height must be positive whole numbers")
     return width, height
 
 
@@ -311,9 +311,13 @@ def _no_nulls(table: pa.Table, name: str, file: Path) -> None:
 
 def _numbers(table: pa.Table, name: str, file: Path) -> NDArray[Any]:
     kind = table.column(name).type
-    if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_null(kind)):
+    if not _numeric(kind):
         raise DatasetError(f"{file}: column {name!r} holds {kind}, not numbers")
     return table.column(name).to_numpy()
+
+
+def _numeric(kind: pa.DataType) -> bool:
+    return bool(pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_null(kind))
 
 
 def _integers(table: pa.Table, name: str, file: Path, least: int | None = None) -> NDArray[np.int64] | None:
@@ -386,13 +390,12 @@ def _matrix(column: pa.Array, name: str, file: Path, width: int | None, rows: ND
     if flat.null_count:
         first = int(np.argmax(flat.is_null().to_numpy(zero_copy_only=False)))
         raise bad_row(file, name, rows[first // expected], " holds a null")
-    try:
-        values = np.asarray(flat.to_numpy(zero_copy_only=False), dtype=np.float64).reshape(len(rows), expected)
-    except (TypeError, ValueError) as error:
-        raise DatasetError(f"{file}: column {name!r} holds {column.type}, not numbers") from error
-    finite = np.isfinite(values).all(axis=1)
-    if not finite.all():
-        raise bad_row(file, name, rows[np.argmin(finite)], " is not finite")
+    if not _numeric(flat.type):
+        raise DatasetError(f"{file}: column {name!r} holds {column.type}, not numbers")
+    values = np.asarray(flat.to_numpy(zero_copy_only=False), dtype=np.float64).reshape(len(rows), expected)
+    if (wrong := ~np.isfinite(values)).any():
+        first, element = np.argwhere(wrong)[0]
+        raise bad_row(file, name, rows[first], f": {values[first, element]} is not finite")
     limit = MAX_VALUE**2 if name == "covariance" else MAX_VALUE
     size = np.abs(values).max(axis=1, initial=0)
     if (size > limit).any():

@@ -18,14 +18,13 @@ from ..matching import PriorRequiredError
 from .executors import Done, Executor, RunOne, processes, serial
 from .experiments import Unit
 from .extras import MissingExtraError
-from .matching_run import MatcherFailedError
 from .records import Tally, tallies
 from .shards import RECORDS, Shards, facts
 
 ATTEMPTS = 3
 """How often a unit is tried before it is given up."""
 
-FINAL = (ValueError, PriorRequiredError, MatcherFailedError, MissingExtraError)
+FINAL = (ValueError, PriorRequiredError, MissingExtraError)
 """Errors that a second attempt would only repeat: they end the run at once."""
 
 
@@ -50,7 +49,7 @@ class Results:
         return {method: Tally.pool(own) for method, own in parts.items()}
 
     def facts(self, experiment: str) -> list[dict[str, Any]]:
-        """What was noted about each of its units: `seconds`, `cpu_seconds`, and what `run` was told `about` them."""
+        """What was noted about each of its units, see `covis.evaluation.executors.RunOne`."""
         return [facts(self.schema(number)) for number in self._numbers(experiment)]
 
     def _numbers(self, experiment: str) -> list[int]:
@@ -65,6 +64,7 @@ def run(
     shared_folder: bool = True,
     about: Mapping[str, Any] | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    complain: Callable[[str], object] = lambda message: None,
 ) -> Results:
     """Run all units that `shards` does not hold yet.
 
@@ -75,6 +75,7 @@ def run(
         shared_folder: workers see that folder and write their shards themselves.
         about: noted in each unit's records.
         progress: called with (units done, units in all).
+        complain: called with what a method failed of, once for each method, as soon as that is known.
 
     Raises:
         UnitFailedError: units failed ATTEMPTS times; all others are finished.
@@ -82,6 +83,10 @@ def run(
     """
     units = tuple(units)
     kept: dict[int, pa.Table] = {}
+    results = Results(units, kept.__getitem__, lambda number: kept[number].schema)
+    if shards is not None:
+        results = Results(units, shards.read, shards.schema)
+    failed: set[str] = set()
     finished = shards.finished() if shards is not None else set()
     run_one = RunOne(units, shards if shared_folder else None, shards is not None, about or {})
     progress(len(finished), len(units))
@@ -92,10 +97,12 @@ def run(
         elif tables is not None:
             kept[number] = tables[RECORDS]
         finished.add(number)
+        for method, failure in facts(results.schema(number))["failures"].items():
+            if method not in failed:
+                complain(failure)
+            failed.add(method)
         progress(len(finished), len(units))
-    if shards is not None:
-        return Results(units, shards.read, shards.schema)
-    return Results(units, kept.__getitem__, lambda number: kept[number].schema)
+    return results
 
 
 def _until_done(

@@ -25,7 +25,7 @@ import pyarrow as pa
 
 from .experiments import Unit, run_unit
 from .pictures import to_table as pictures_table
-from .records import to_table
+from .records import failures, to_table
 from .shards import PICTURES, RECORDS, Shards, with_facts
 
 
@@ -68,7 +68,8 @@ class RunOne:
         units: all units of the run.
         shards: where to write the tables; None hands them back.
         pictures: also make the frames that a report shows.
-        about: kept in each unit's records, together with the `seconds` and `cpu_seconds` that it took.
+        about: kept in each unit's records, together with the `seconds` and `cpu_seconds` that it took and the
+            `failures` of methods.
     """
 
     units: tuple[Unit, ...]
@@ -81,7 +82,8 @@ class RunOne:
         try:
             result = run_unit(self.units[number], self.pictures)
             took = {"seconds": perf_counter() - start, "cpu_seconds": process_time() - cpu_start}
-            tables = {RECORDS: with_facts(to_table(result.records), **took, **self.about)}
+            failed = failures(result.records)
+            tables = {RECORDS: with_facts(to_table(result.records), **took, failures=failed, **self.about)}
             if self.pictures:
                 tables[PICTURES] = pictures_table(result.pages)
             if self.shards is None:

@@ -125,7 +125,7 @@ def target_name(experiment: Experiment) -> str:
     """The name rows carry: a dataset's own, a scene's, `synthetic-...`."""
     if experiment.kind == "dataset":
         return dataset(experiment.target, experiment.seeds[0]).name
-    return f"synthetic-{experiment.target}" if experiment.kind == "synthetic" else experiment.target
+    return synthetic.PREFIX + experiment.target if experiment.kind == "synthetic" else experiment.target
 
 
 def absolute(experiment: Experiment) -> Experiment:

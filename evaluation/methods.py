@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -10,10 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..matching import Matcher, Matching, load_matcher
+from ..matching import Matcher, Matching, bayes, load_matcher
 from .disturbance import Disturbance
 
-EVALUATION_ONLY = ("oracle", "random")
+EVALUATION_ONLY = ("oracle", "oracle-pose", "random")
+"""The true matches; `bayes` that knows the true relative pose; chance."""
 
 
 @dataclass(frozen=True)
@@ -44,9 +46,30 @@ class Method:
             raise ValueError(f"--method {text!r} names no {'disturbance after @' if name else 'method'}")
         return cls(text, name, _options(options, text), Disturbance.of(_options(disturbance, text)))
 
+    def check(self) -> None:
+        """Raises ValueError where there is no such matcher, or it does not take these options."""
+        matcher = self.load()
+        if matcher is None:
+            taken: set[str] = set()
+        else:
+            try:
+                parameters = inspect.signature(matcher).parameters.values()
+            except ValueError:  # some builtins have none
+                return
+            if any(p.kind is p.VAR_KEYWORD for p in parameters):
+                return
+            taken = {p.name for p in parameters if p.kind is not p.POSITIONAL_ONLY}
+        taken -= {"source", "target", "prior", "rng"}
+        for option in self.options:
+            if option not in taken:
+                known = f"its options are {', '.join(sorted(taken))}" if taken else "it has none"
+                raise ValueError(f"--method {self.label!r}: {self.name} has no option {option!r}; {known}")
+
     def load(self) -> Matcher | None:
-        """The matcher, or None for the evaluation-only baselines, which need the truth."""
-        return None if self.name in EVALUATION_ONLY else load_matcher(self.name)
+        """The matcher, or None for `oracle` and `random`, which are none."""
+        if self.name in EVALUATION_ONLY:
+            return bayes if self.name == "oracle-pose" else None
+        return load_matcher(self.name)
 
 
 def oracle(source_identity: NDArray[np.int64], target_identity: NDArray[np.int64]) -> Matching:

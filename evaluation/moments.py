@@ -19,8 +19,18 @@ from ..fusion.team import GATE, fuse_team
 from ..matching import Matching, ObjectGraph, RelativePose
 from ..matching.metrics import Counts, count, is_correct
 from ..matching.pose import Array, invert, transform
-from .datasets import Dataset, DatasetError, Frame, Stored, View, load_dataset, optional_column, prior_between
-from .matching_run import match_pair
+from .datasets import (
+    Dataset,
+    DatasetError,
+    Frame,
+    Stored,
+    View,
+    load_dataset,
+    optional_column,
+    prior_between,
+    true_relative_pose,
+)
+from .matching_run import PairTruth, match_pair
 from .methods import Method
 from .pictures import jpeg
 from .sequence import PairTrackers
@@ -206,7 +216,7 @@ def _match(
             method,
             source.graph,
             target.graph,
-            (source.identity, target.identity),
+            PairTruth((source.identity, target.identity), true_relative_pose(source, target)),
             prior_between(source, target) if settings.pose == "known" else None,
             (settings.seed, frame.index, i * len(frame.views) + j),
             f"{dataset.name}, frame {frame.index}, {source.robot} and {target.robot}",

@@ -47,6 +47,7 @@ SCHEMA = pa.schema(
         ("common_range_m", pa.list_(pa.float64())),
         ("common_occlusion", pa.list_(pa.float64())),
         ("common_found", pa.list_(pa.bool_())),
+        ("failure", pa.string()),
     ]
 )
 
@@ -59,7 +60,8 @@ class Record:
     datasets that do not know); `scores` and `hits` run over the emitted matches; the errors (m) over objects both
     localised, where `positions_scored`, each with the object's distance from the robot that errs and how much of it is
     hidden there (0 to 1; empty on datasets, which do not know). `common_...` runs over the objects both detected: the
-    larger distance, the larger occlusion (empty on datasets), and whether they were matched rightly.
+    larger distance, the larger occlusion (empty on datasets), and whether they were matched rightly. `failure` is what
+    the method failed of on this pair, on which it then counts as having found nothing.
     """
 
     target: str
@@ -83,6 +85,7 @@ class Record:
     common_range_m: list[float] = field(default_factory=list)
     common_occlusion: list[float] = field(default_factory=list)
     common_found: list[bool] = field(default_factory=list)
+    failure: str | None = None
     experiment: str = ""
     seed: int = 0
 
@@ -121,6 +124,7 @@ class Tally:
     Attributes:
         episodes: by seed and episode, how many matches were correct, were retrieved, were there to be found (3,).
         frames, pairs: how many.
+        n_failed: pairs on which the method failed.
         counts: (pairs, 3) correct, retrieved and common matches of each pair.
         match_ms: (pairs,).
         scores, hits: of all emitted matches.
@@ -132,6 +136,7 @@ class Tally:
     episodes: dict[Hashable, NDArray[np.float64]]
     frames: int
     pairs: int
+    n_failed: int
     counts: NDArray[np.int64]
     match_ms: NDArray[np.float64]
     scores: NDArray[np.float64]
@@ -155,6 +160,7 @@ class Tally:
             episodes={(int(seed), int(episode)): row for (seed, episode), row in zip(keys, sums, strict=True)},
             frames=len(np.unique(where, axis=0)),
             pairs=len(table),
+            n_failed=len(table["failure"].drop_null()) if "failure" in table.column_names else 0,
             counts=counts.astype(np.int64),
             match_ms=table["match_ms"].to_numpy(),
             scores=_flat(table, "scores"),
@@ -177,6 +183,7 @@ class Tally:
             episodes=episodes,
             frames=sum(t.frames for t in tallies),
             pairs=sum(t.pairs for t in tallies),
+            n_failed=sum(t.n_failed for t in tallies),
             counts=np.concatenate([np.zeros((0, 3), dtype=np.int64), *(t.counts for t in tallies)]),
             match_ms=np.concatenate([np.zeros(0), *(t.match_ms for t in tallies)]),
             scores=np.concatenate([np.zeros(0), *(t.scores for t in tallies)]),
@@ -208,6 +215,7 @@ class Tally:
             "n_correct": correct,
             "n_retrieved": retrieved,
             "n_covisible": common,
+            "n_failed": self.n_failed,
         }
         if self.visible is not None:
             row |= {"n_visible": self.visible, "scene_recall": correct / self.visible if self.visible else 0.0}
@@ -224,6 +232,15 @@ def tallies(table: pa.Table) -> dict[str, Tally]:
     """By method, of records as `to_table` makes them."""
     methods = table["method"].unique().to_pylist()
     return {method: Tally.of(table.filter(pc.equal(table["method"], method))) for method in methods}
+
+
+def failures(records: Sequence[Record]) -> dict[str, str]:
+    """By method that failed on some pair, of what it did first."""
+    found: dict[str, str] = {}
+    for record in records:
+        if record.failure is not None:
+            found.setdefault(record.method, record.failure)
+    return found
 
 
 def summarise(records: Sequence[Record]) -> dict[str, Any]:

@@ -13,8 +13,8 @@ from ..matching import Matching
 from ..matching.metrics import Counts, is_correct
 from .dataset_errors import Matched, fused, with_errors
 from .dataset_pages import page, shared
-from .datasets import Dataset, Frame, View, prior_between
-from .matching_run import match_pair
+from .datasets import Dataset, Frame, View, prior_between, true_relative_pose
+from .matching_run import PairTruth, attempt
 from .methods import Method
 from .pictures import PictureBook
 from .records import Record
@@ -90,15 +90,16 @@ def _match_all(
     """What each method makes of a pair of views."""
     frame, source, target = pair
     prior = prior_between(source, target) if settings.pose == "known" else None
+    truth = PairTruth((source.identity, target.identity), true_relative_pose(source, target))
     where = f"{name}, frame {frame.index}, {source.robot} and {target.robot}"
     a, b = frame.views.index(source), frame.views.index(target)
     number = a * len(frame.views) + b
     for method in methods:
-        matching, elapsed = match_pair(
+        matching, elapsed, failure = attempt(
             method,
             source.graph,
             target.graph,
-            (source.identity, target.identity),
+            truth,
             prior,
             (settings.seed, frame.index, number),
             where,
@@ -117,6 +118,7 @@ def _match_all(
             source=source.robot,
             partner=target.robot,
             visible=_n_visible(source, target),
+            failure=failure,
             **_common(source, target, matching),
         )
         yield Matched(a, b, matching, record)

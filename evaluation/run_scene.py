@@ -23,8 +23,8 @@ from ..envs.claims import Claims, claims_to_action
 from ..envs.collaborative import CollaborativeEnv
 from ..envs.scenes import parallel_env
 from ..envs.scoring import PairScore, StepScore, Truth, score, tie
-from ..matching.pose import transform
-from .matching_run import match_pair
+from ..matching.pose import invert, transform
+from .matching_run import PairTruth, attempt
 from .methods import Method
 from .pictures import Page, PictureBook, Result, Sight, jpeg, rounded
 from .records import Record
@@ -44,6 +44,7 @@ class SceneFrame:
     views: list[View]
     matchings: dict[str, Matchings]
     match_ms: dict[str, dict[tuple[int, int], float]]
+    failures: dict[str, dict[tuple[int, int], str | None]]
     claims: dict[str, list[Claims]]
     scores: dict[str, StepScore]
     truth: Truth
@@ -132,19 +133,21 @@ def _match_frame(
     trackers: PairTrackers | None,
 ) -> SceneFrame:
     truth = env.ground_truth()
+    cameras = truth.T_world_camera
     identities = [identity(view, i, env) for i, view in enumerate(views)]
-    frame = SceneFrame(episode, step, views, {}, {}, {}, {}, truth, occlusion(env))
+    frame = SceneFrame(episode, step, views, {}, {}, {}, {}, {}, truth, occlusion(env))
     for method in methods:
         found: Matchings = {}
         elapsed: dict[tuple[int, int], float] = {}
+        failures: dict[tuple[int, int], str | None] = {}
         for number, (i, j) in enumerate(combinations(range(len(views)), 2)):
             if min(len(views[i].detections), len(views[j].detections)) < MIN_DETECTIONS:
                 continue
-            found[i, j], elapsed[i, j] = match_pair(
+            found[i, j], elapsed[i, j], failures[i, j] = attempt(
                 method,
                 views[i].detections.graph,
                 views[j].detections.graph,
-                (identities[i], identities[j]),
+                PairTruth((identities[i], identities[j]), invert(cameras[i]) @ cameras[j]),
                 relative_pose(views[i], views[j]) if settings.pose == "known" else None,
                 (settings.seed, episode, step, number),
                 f"{env.name}, episode {episode}, step {step}, robots {i} and {j}",
@@ -153,6 +156,7 @@ def _match_frame(
         said = claims(views, found, env.max_detections)
         frame.matchings[method.label] = found
         frame.match_ms[method.label] = elapsed
+        frame.failures[method.label] = failures
         frame.claims[method.label] = said
         frame.scores[method.label] = score(said, truth)
     return frame
@@ -197,6 +201,7 @@ def records(scene: str, frame: SceneFrame, method: Method) -> Iterator[Record]:
             common_range_m=distance[[pair.a, pair.b]][:, common].max(axis=0).tolist(),
             common_occlusion=frame.occlusion[[pair.a, pair.b]][:, common].max(axis=0).tolist(),
             common_found=np.isin(common, result.tied[pair.a, pair.assertions[pair.hits, 0]]).tolist(),
+            failure=frame.failures[method.label][pair.a, pair.b],
         )
 
 

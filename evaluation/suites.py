@@ -9,6 +9,7 @@ from typing import Any
 from .comparison import Ordering
 from .experiments import Experiment
 from .settings import Settings
+from .synthetic import PREFIX
 
 TABLE_1 = ("rrwm", "icp", "bcagm", "rrwhm", "reid", "mos", "rgm-no-uncertainty", "rgm-no-covisibility", "rgm")
 """The nine methods of the paper's Table 1, in its order."""
@@ -72,7 +73,7 @@ def _scene(
 
 
 def _synthetic(problem: str, methods: tuple[str, ...], pairs: int, seeds: tuple[int, ...]) -> Experiment:
-    return Experiment(f"synthetic-{problem}", "synthetic", problem, methods, Settings(episodes=pairs), seeds)
+    return Experiment(PREFIX + problem, "synthetic", problem, methods, Settings(episodes=pairs), seeds)
 
 
 FROM_PIXELS = Settings(preset="paper", perception="learned", episodes=10)

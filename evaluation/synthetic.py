@@ -20,6 +20,9 @@ from .datasets import Frame, View, pose_covariance
 
 Ints = NDArray[np.int64]
 
+PREFIX = "synthetic-"
+"""Of the names of problems, where a target may be something else."""
+
 BEARING_STD_RAD = 0.007
 POSE_STD = (0.3, 0.0175)
 """Noise of the robots' poses: m per axis, rad of heading."""

@@ -73,7 +73,7 @@ def view(
     if not methods:
         raise ValueError("at least one method is needed")
     for method in methods:
-        method.load()
+        method.check()
     source = _source(target, methods, settings)
     recording = rr.RecordingStream("covis", recording_id=f"{Path(target).name}-{settings.seed}")
     recording.set_log_time_enabled(False)

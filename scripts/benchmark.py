@@ -17,7 +17,7 @@ from ..evaluation.extras import require
 from ..evaluation.methods import Method
 from ..evaluation.settings import Settings
 from ..evaluation.suites import SUITES
-from .console import err, fail, out, progress_bar, require_writable, require_writable_figure, write_rows
+from .console import complain, err, fail, out, progress_bar, require_writable, require_writable_figure, write_rows
 
 
 def benchmark(
@@ -68,7 +68,7 @@ def benchmark(
             require("viz")
             require_writable_figure(figure)
         with progress_bar("benchmark") as progress:
-            how |= {"progress": progress, "judge": verdicts.extend}
+            how |= {"progress": progress, "judge": verdicts.extend, "complain": complain}
             rows = _run(targets, method or [], _only(given), _only(changes), how)
     except (ValueError, RuntimeError, OSError) as error:
         fail(error)
@@ -83,6 +83,12 @@ def benchmark(
         out.print(table(rows))
         if verdicts:
             out.print(verdict_table(verdicts))
+    if any(row["n_failed"] for row in rows):
+        for row in rows:
+            if row["n_failed"]:
+                where = f"{row['n_failed']} of {row['pairs']} pairs of {_target(row)}"
+                complain(f"{_method(row)} failed on {where}, and counts as having found nothing there")
+        raise typer.Exit(1)
 
 
 def _run(
@@ -171,6 +177,7 @@ def table(rows: list[dict[str, Any]]) -> Table:
     """The rows for a person: target, method and the figures that are there."""
     caption = "to best: difference of F1 to the highest; ~ where noise alone may explain it (paired over episodes)"
     compared = any(row.get("ties_best") is not None for row in rows)
+    rows = _told_apart(rows)
     view = Table(title=None, header_style="bold", caption=caption if compared else None, caption_justify="left")
     shown = [column for column in COLUMNS if any(column[2](row) for row in rows)]
     for key, title, _ in shown:
@@ -179,6 +186,14 @@ def table(rows: list[dict[str, Any]]) -> Table:
         last = after is None or _target(after) != _target(row)
         view.add_row(*(cell(row) for _, _, cell in shown), end_section=last)
     return view
+
+
+def _told_apart(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Data sets of the same name by their folders."""
+    folders: dict[str, set[str]] = {}
+    for row in rows:
+        folders.setdefault(row["target"], set()).add(row["experiment"])
+    return [row | {"target": row["experiment"]} if len(folders[row["target"]]) > 1 else row for row in rows]
 
 
 def verdict_table(verdicts: list[dict[str, Any]]) -> Table:

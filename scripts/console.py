@@ -17,9 +17,14 @@ err = Console(stderr=True)
 out = Console() if Console().is_terminal else Console(width=180)
 
 
+def complain(error: BaseException | str) -> None:
+    """One line on stderr."""
+    err.print(f"[bold red]covis:[/] {_escape(str(error))}", highlight=False, soft_wrap=True)
+
+
 def fail(error: BaseException | str) -> NoReturn:
     """One line on stderr, exit status 2."""
-    err.print(f"[bold red]covis:[/] {_escape(str(error))}", highlight=False, soft_wrap=True)
+    complain(error)
     raise typer.Exit(2)
 
 

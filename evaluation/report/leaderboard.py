@@ -60,6 +60,12 @@ COLUMNS = (
     ),
     Column("Fused, m", "Mean displacement error after fusion, over the same objects.", _row("displacement_fused_m")),
     Column("ms a pair", "Median time of the matcher for one pair of views.", _row("match_ms"), "{:.2f}"),
+    Column(
+        "Failed",
+        "Pairs on which the method failed, and counts as having found nothing.",
+        lambda group, entry: entry.row.get("n_failed") or None,
+        "{:d}",
+    ),
 )
 
 

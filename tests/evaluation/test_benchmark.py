@@ -1,18 +1,19 @@
 """Rows, intervals, parallel and resumed runs."""
 
 import json
+import re
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from covis.evaluation import experiments, extras
 from covis.evaluation.benchmark import benchmark, plan
 from covis.evaluation.datasets import DatasetError, load_dataset
-from covis.evaluation.matching_run import MatcherFailedError
 from covis.evaluation.methods import Method
 from covis.evaluation.settings import SCENE_NAMES, Settings
 from covis.evaluation.statistics import bootstrap_f1
-from covis.matching import Matching, PriorRequiredError
+from covis.matching import Matching, PriorRequiredError, reid
 from covis.matching.metrics import Counts
 
 METHODS = [Method.parse(m) for m in ("oracle", "hungarian:gate_m=1.5", "reid", "random")]
@@ -40,6 +41,33 @@ def broken(source, target, *, prior=None, rng=None):
 
 def out_of_range(source, target, *, prior=None, rng=None):
     return Matching(np.array([[0, len(target)]]), np.ones(1))
+
+
+def leaves(source, target, *, prior=None, rng=None):
+    raise SystemExit(3)
+
+
+def unsure(source, target, *, prior=None, rng=None):
+    return Matching(np.array([[0, 0]]), np.array([np.nan]))
+
+
+def repeats(source, target, *, prior=None, rng=None):
+    return Matching(np.array([[0, 0], [1, 0]]), np.ones(2))
+
+
+def of_another_kind(source, target, *, prior=None, rng=None):
+    return [(0, 0)]
+
+
+def fails_on_few(source, target, *, prior=None, rng=None):
+    if len(source) < 7:
+        raise ValueError(f"{len(source)} are too few")
+    return reid(source, target)
+
+
+def talks(source, target, *, prior=None, rng=None):
+    print("hello")
+    return Matching.empty()
 
 
 def without_time(rows):
@@ -129,8 +157,6 @@ def test_a_method_that_needs_a_prior_says_so(small_dataset):
 
 
 def test_known_poses_need_poses(tmp_path, small_dataset):
-    import pyarrow.parquet as pq
-
     table = pq.read_table(small_dataset / "robots.parquet").drop_columns(["pose"])
     pq.write_table(table, small_dataset / "robots.parquet")
     with pytest.raises(DatasetError, match="has no pose in this frame"):
@@ -138,16 +164,82 @@ def test_known_poses_need_poses(tmp_path, small_dataset):
 
 
 @pytest.mark.parametrize(
-    ("name", "message"), [("broken", "ZeroDivisionError: no"), ("out_of_range", "pairs name index")]
+    ("matcher", "message"),
+    [
+        (broken, "ZeroDivisionError: no"),
+        (leaves, "SystemExit: 3"),
+        (out_of_range, "pairs name index"),
+        (unsure, r"ValueError: scores must lie in \[0, 1\], got \[nan\]"),
+        (repeats, "ValueError: pairs repeat an index in column 1"),
+        (of_another_kind, "it returned list, not a Matching"),
+    ],
 )
-def test_a_failing_matcher_is_named(small_dataset, name, message, monkeypatch):
-    monkeypatch.setattr(Method, "load", lambda self: {"broken": broken, "out_of_range": out_of_range}[self.name])
-    with pytest.raises(MatcherFailedError, match=f"method '{name}' .*{message}"):
-        benchmark([str(small_dataset)], [Method.parse(name)], Settings())
+def test_a_failing_matcher_is_named_and_costs_no_other_its_row(small_dataset, matcher, message, monkeypatch, tmp_path):
+    monkeypatch.setattr(experiments, "FRAMES_PER_UNIT", 2)
+    sound = benchmark([str(small_dataset)], METHODS[:1], Settings())
+    name = f"{__name__}:{matcher.__name__}"
+    said = []
+    methods = [Method.parse(name), METHODS[0]]
+    failed, oracle = benchmark([str(small_dataset)], methods, Settings(), out=tmp_path / "run", complain=said.append)
+    assert own_figures([oracle]) == own_figures(sound)
+    assert (failed["n_failed"], failed["n_retrieved"], failed["f1"], oracle["n_failed"]) == (6, 0, 0.0, 0)
+    (complaint,) = said
+    assert re.search(f"method '{name}' on small, frame 0, .*{message}", complaint)
+    assert benchmark([str(small_dataset)], methods, Settings(), out=tmp_path / "run", resume=True) == [failed, oracle]
+
+
+def test_a_matcher_that_fails_now_and_then_counts_where_it_does_not(small_dataset):
+    now_and_then, reid = benchmark(
+        [str(small_dataset)], [Method.parse(f"{__name__}:fails_on_few"), Method.parse("reid")], Settings()
+    )
+    assert 0 < now_and_then["n_failed"] < now_and_then["pairs"] == reid["pairs"]
+    assert 0 < now_and_then["n_retrieved"] < reid["n_retrieved"]
+    assert now_and_then["n_covisible"] == reid["n_covisible"]
+
+
+def test_what_a_matcher_prints_goes_to_standard_error(small_dataset, capsys):
+    benchmark([str(small_dataset)], [Method.parse(f"{__name__}:talks")], Settings())
+    said = capsys.readouterr()
+    assert (said.out, set(said.err.split())) == ("", {"hello"})
+
+
+def test_an_option_that_a_method_does_not_have_is_found_before_anything_runs(small_dataset, monkeypatch):
+    monkeypatch.setattr(experiments, "run_episodes", None)
+    for text, message in (
+        ("reid:min_similarty=0.5", "reid has no option 'min_similarty'; its options are min_similarity"),
+        ("oracle:a=1", "oracle has no option 'a'; it has none"),
+    ):
+        with pytest.raises(ValueError, match=f"--method '{text}': {message}"):
+            benchmark([str(small_dataset)], [Method.parse(text)], Settings())
+
+
+def test_generated_graphs_by_name_follow_the_seed():
+    one, same, other = (
+        benchmark(["synthetic-smrc-hard"], METHODS[2:3], Settings(seed=seed, episodes=5))[0] for seed in (5, 5, 6)
+    )
+    assert (one["target"], one["seeds"], one["pairs"]) == ("synthetic-smrc-hard", [5], 5)
+    assert without_time([one]) == without_time([same])
+    assert without_time([one]) != without_time([other])
+
+
+def test_the_true_pose_bounds_what_poses_can_give():
+    methods = [Method.parse(text) for text in ("oracle-pose", "bayes", "oracle-pose:min_score=0.99")]
+    pose, unknown, strict = benchmark(["synthetic-smrc-hard"], methods, Settings(seed=3, episodes=20))
+    assert pose["f1"] > 0.85 > unknown["f1"]
+    assert strict["n_retrieved"] < pose["n_retrieved"]
+    assert not pose["ties_best"]
+    assert unknown["f1_minus_best"] == 0.0
+
+
+def test_the_true_pose_must_be_known(small_dataset):
+    table = pq.read_table(small_dataset / "robots.parquet").drop_columns(["pose_truth"])
+    pq.write_table(table, small_dataset / "robots.parquet")
+    with pytest.raises(ValueError, match="oracle-pose needs the true poses, which are not known on small, frame 0"):
+        benchmark([str(small_dataset)], [Method.parse("oracle-pose")], Settings())
 
 
 def test_unknown_targets_are_refused():
-    with pytest.raises(ValueError, match="target 'nowhere' is neither a dataset folder nor a scene"):
+    with pytest.raises(ValueError, match="target 'nowhere' is neither a dataset folder nor one of connected_driving"):
         benchmark(["nowhere"], METHODS, Settings())
 
 

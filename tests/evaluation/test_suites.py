@@ -35,7 +35,7 @@ def nearest(source, target, *, prior=None, rng=None, count=2):
 def test_all_suites_are_there():
     assert set(SUITES) == NAMES
     assert not NAMES & set(SCENE_NAMES)
-    assert set(BASELINES) == set(EVALUATION_ONLY)
+    assert set(BASELINES) < set(EVALUATION_ONLY)
 
 
 @pytest.mark.parametrize("suite", SUITES.values(), ids=lambda suite: suite.id)

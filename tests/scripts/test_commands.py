@@ -42,6 +42,31 @@ def test_benchmark_writes_a_file_and_a_table(small_dataset, tmp_path):
     assert json.loads(file.read_text())["rows"][0]["target"] == "small"
 
 
+def test_datasets_of_one_name_are_told_apart(dataset_writer, tmp_path):
+    folders = [str(dataset_writer(tmp_path / name, n_frames=2)) for name in ("a", "b")]
+    result = runner.invoke(app, ["benchmark", *folders, "--method", "oracle"])
+    assert result.exit_code == 0, result.output
+    assert all(folder in result.stdout for folder in folders)
+
+
+def test_a_method_that_fails_costs_no_other_its_row(small_dataset, tmp_path):
+    out = tmp_path / "run"
+    methods = ["--method", f"{__name__}:fails", "--method", "oracle"]
+    result = runner.invoke(app, ["benchmark", str(small_dataset), *methods, "--out", str(out), "--json", "-"])
+    assert result.exit_code == 1
+    rows = json.loads(result.stdout)["rows"]
+    assert [(row["f1"], row["n_failed"]) for row in rows] == [(0.0, 6), (1.0, 0)]
+    first, last = result.stderr.splitlines()
+    assert f"method '{__name__}:fails' on small, frame 0, robot_0 and robot_1: KeyError: 'no'" in first
+    assert "fails failed on 6 of 6 pairs of small, and counts as having found nothing there" in last
+    assert runner.invoke(app, ["report", str(out)]).exit_code == 0
+    assert "| Failed |" in (out / "report.md").read_text()
+
+
+def fails(source, target, *, prior=None, rng=None):
+    raise KeyError("no")
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
