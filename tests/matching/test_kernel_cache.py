@@ -4,12 +4,15 @@ import os
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numba
+import numpy as np
 import pytest
+from numba.core import caching
 
 from covis.matching import kernel_cache
-from covis.matching.kernel_cache import KernelLocator, sources_digest
+from covis.matching.kernel_cache import KernelLocator, sources_digest, temporary_folder
 from covis.matching.pose import _rodrigues
 
 
@@ -45,6 +48,18 @@ def test_only_our_kernels_are_stamped():
     assert isinstance(_rodrigues._cache._impl.locator, KernelLocator)
     foreign = numba.njit(cache=True)(lambda x: x)
     assert not isinstance(foreign._cache._impl.locator, KernelLocator)
+
+
+@pytest.mark.skipif(numba.config.DISABLE_JIT, reason="nothing is compiled")
+def test_kernels_that_cannot_be_stored_last_as_long_as_the_process(monkeypatch):
+    monkeypatch.setattr(caching.CacheImpl, "_locator_classes", [KernelLocator])
+    with pytest.warns(RuntimeWarning, match="set NUMBA_CACHE_DIR"):
+        locator = KernelLocator.from_function(_rodrigues.py_func, kernel_cache.__file__)
+    assert Path(temporary_folder()) in Path(locator.get_cache_path()).parents
+    assert Path(locator.get_cache_path()).is_dir()
+    kernel = numba.njit(cache=True)(_rodrigues.py_func)
+    kernel(np.array([0.1, 0.2, 0.3]))
+    assert list(Path(locator.get_cache_path()).parent.rglob("*.nbi"))
 
 
 @pytest.mark.skipif(numba.config.DISABLE_JIT, reason="nothing is compiled")
