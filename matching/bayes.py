@@ -13,14 +13,15 @@ import numpy as np
 
 from .bayes_calibration import CALIBRATIONS, Evidence, calibrated, kind_of, pair_features
 from .bayes_overlap import overlap_features
-from .bayes_prepare import LOG_2PI, Problem, Settings, levelling_rotation, prepare, ranges
+from .bayes_prepare import LOG_2PI, Problem, Settings, levelling_rotation, prepare, ranges, reach_of
 from .bayes_solve import Modes, Prior, decode, mix, solve_levelled, solve_spatial
 from .bayes_view import View
 from .graph import DEFAULT_BEARING_STD_RAD, Hypothesis, Matching, ObjectGraph, check_comparable
 from .pose import Array, RelativePose
 
-HALF_RANGE_QUANTILE = 0.85
-OCCLUDER = 0.022
+OCCLUDER = 0.017
+"""Half width of what hides, as a fraction of the reach."""
+
 OCCLUDED = 0.75
 RIGHT_ANGLE_STD_RAD = math.radians(2.0)
 """How far the headings of robots on streets or in buildings differ from a multiple of a right angle."""
@@ -49,9 +50,9 @@ def bayes(
     bearing_std_rad: float = DEFAULT_BEARING_STD_RAD,
     class_sharpness: float = 2.25,
     mislabel: float = 0.01,
-    extent: float = 0.01,
-    depth_offset: float = 0.035,
-    depth_offset_std: float = 0.015,
+    extent: float = 0.008,
+    depth_offset: float = 0.027,
+    depth_offset_std: float = 0.012,
     scale_std: float = 0.0,
     detection: float = 0.75,
     screened: int = 300,
@@ -63,7 +64,8 @@ def bayes(
 
     Gravity is used where both graphs carry `up`; field of view, the robots themselves and occlusion where both know
     their view (`intrinsics` and `image_size`, or `horizontal_fov_rad` with `forward` and `up`). Lengths without a unit
-    are fractions of the median range of all detections, so that the answer does not depend on the unit of length.
+    are fractions of the reach, the range within which .85 of all detections lie, so that the answer does not depend on
+    the unit of length.
 
     Args:
         source, target: the two robots' graphs.
@@ -105,7 +107,7 @@ def bayes(
     if n == 0 or m == 0:
         return Matching.empty()
     q = Settings(
-        class_sharpness, mislabel, 4.0, 3.0, 0.8, 1.2, 1.5, extent, depth_offset, depth_offset_std, scale_std, 0.04
+        class_sharpness, mislabel, 4.0, 3.0, 0.8, 1.2, 1.5, extent, depth_offset, depth_offset_std, scale_std, 0.031
     )
     if source.covariances is not None and target.covariances is not None:
         q = q._replace(extent=REPORTED_EXTENT * extent)
@@ -227,14 +229,13 @@ def _arrays(graph: ObjectGraph, scale: float) -> tuple[Array, Array, Array, Arra
 
 def _views(source: ObjectGraph, target: ObjectGraph, L_a: Array, L_b: Array, detection: float) -> tuple[View, View]:
     distance = ranges(np.ascontiguousarray(source.positions), np.ascontiguousarray(target.positions))
-    median = max(float(distance[len(distance) // 2]), 1e-3)
-    half_range = max(float(distance[int(HALF_RANGE_QUANTILE * (len(distance) - 1))]), 1e-3)
+    reach = float(reach_of(distance))
     planes = [_view_planes(source), _view_planes(target)]
     known = float(planes[0] is not None and planes[1] is not None)
     views = []
     for normals, L in zip(planes, (L_a, L_b), strict=True):
         turned = np.zeros((0, 3)) if normals is None else np.ascontiguousarray(normals @ L.T)
-        views.append(View(known, turned, half_range, detection, OCCLUDER * median, OCCLUDED))
+        views.append(View(known, turned, reach, detection, OCCLUDER * reach, OCCLUDED))
     return views[0], views[1]
 
 

@@ -14,6 +14,9 @@ Indices = NDArray[np.int64]
 
 LOG_2PI = float(np.log(2 * np.pi))
 
+REACH_QUANTILE = 0.85
+"""Share of the detections that lie within the reach."""
+
 CUT_OFF = 2.0
 """Half of an object's length, in near-face offsets: nearer to the border of an image, part of it may be missing."""
 
@@ -274,7 +277,7 @@ def spread_volume(p: Array, S: Array) -> float:
 
 
 class Settings(NamedTuple):
-    """The model's constants; lengths are in units of the median range of all detections (see `bayes`)."""
+    """The model's constants; lengths are fractions of the reach (see `bayes`)."""
 
     class_sharpness: float
     mislabel: float
@@ -330,6 +333,16 @@ def ranges(positions: Array, others: Array) -> Array:
         p = positions[k] if k < n else others[k - n]
         out[k] = np.sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2])
     return np.sort(out)
+
+
+@njit(cache=True)
+def reach_of(distances: Array) -> float:
+    """The views' reach, m, of all distances in ascending order: what lengths of objects are fractions of.
+
+    Detectors lose objects where their images become small, so that it goes with the objects' size; the median range,
+    beside it, falls by a factor of three where a few objects happen to be near.
+    """
+    return max(distances[int(REACH_QUANTILE * (len(distances) - 1))], 1e-3)
 
 
 @njit(cache=True)
@@ -413,12 +426,13 @@ def prepare(
     level(positions_b, depth_b, covariances_b, bearing_variance, L_b, p_b, S_b)
     distance = ranges(positions_a, positions_b)
     median_range = max(distance[(n + m) // 2], 1e-3)
+    reach = reach_of(distance)
     if cameras:
-        allow_for_extent(p_a, S_a, q.extent * median_range, q.depth_offset * median_range)
-        allow_for_extent(p_b, S_b, q.extent * median_range, q.depth_offset * median_range)
+        allow_for_extent(p_a, S_a, q.extent * reach, q.depth_offset * reach)
+        allow_for_extent(p_b, S_b, q.extent * reach, q.depth_offset * reach)
         if len(covariances_a) == 0 and len(covariances_b) == 0:
-            allow_for_border(p_a, S_a, planes_a, CUT_OFF * q.depth_offset * median_range)
-            allow_for_border(p_b, S_b, planes_b, CUT_OFF * q.depth_offset * median_range)
+            allow_for_border(p_a, S_a, planes_a, CUT_OFF * q.depth_offset * reach)
+            allow_for_border(p_b, S_b, planes_b, CUT_OFF * q.depth_offset * reach)
     likely = np.full((n + 1, m + 1), -1e9)
     attributes = np.zeros((n, m))
     top_a, top_b = np.zeros(n, np.int64), np.zeros(m, np.int64)
@@ -435,7 +449,7 @@ def prepare(
     )
     likely[:n, :m] = attributes
     height = height_variance = robot_height_log = 0.0
-    robot_std = q.robot_extent * median_range
+    robot_std = q.robot_extent * reach
     robot_variance = robot_std**2
     if gravity:
         variance, mean_a, mean_b = height_spread(p_a, S_a, p_b, S_b)
@@ -470,7 +484,7 @@ def prepare(
     classes = np.unique(np.concatenate((top_a, top_b))) if offset else np.zeros(0, np.int64)
     B_a, B_b = bias_vectors(p_a, top_a, classes, 0, scaled), bias_vectors(p_b, top_b, classes, 1, scaled)
     precision = np.empty(B_a.shape[1])
-    precision[:] = 1.0 / max(q.depth_offset_std * median_range, 1e-9) ** 2
+    precision[:] = 1.0 / max(q.depth_offset_std * reach, 1e-9) ** 2
     if scaled:
         precision[len(classes) :] = 1.0 / q.scale_std**2
     return Problem(

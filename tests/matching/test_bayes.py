@@ -326,6 +326,25 @@ def test_an_object_cut_off_by_the_border_of_an_image_is_matched():
         assert all([i, i] in pairs for i in range(1, 8))
 
 
+def test_lengths_of_objects_do_not_follow_a_few_near_ones():
+    """Near faces lie as far from the middles, and the robots are as large, when most of the objects come near."""
+    q = Settings(2.25, 0.01, 4.0, 3.0, 0.8, 1.2, 1.5, 0.008, 0.03, 0.012, 0.0, 0.03)
+    far, near = np.linspace(30.0, 60.0, 10), np.linspace(30.0, 60.0, 10)
+    near[:6] = np.linspace(3.0, 8.0, 6)
+
+    def prepared(ranges):
+        p = np.c_[ranges, np.zeros(10), np.zeros(10)]
+        side = p, np.full(10, 0.1), np.empty((0, 3, 3)), np.ones((10, 1)), np.zeros(10), np.eye(3)
+        return prepare(*side, *side, 0.007**2, True, True, False, np.empty((0, 3)), np.empty((0, 3)), q)
+
+    a, b = prepared(far), prepared(near)
+    assert b.median_range < 0.6 * a.median_range
+    np.testing.assert_allclose(a.p_a[-2, 0], 60.0 + 0.03 * far[8], atol=0.05)
+    np.testing.assert_allclose(a.p_a[-2], b.p_a[-2], atol=0.01)
+    np.testing.assert_allclose(a.S_a[-1, :2, :2], b.S_a[-1, :2, :2])
+    np.testing.assert_allclose(a.bias_precision, b.bias_precision)
+
+
 def test_border_of_the_view_widens_only_what_is_near_it_and_only_across_the_border():
     planes = np.array([[0.0, 1.0, 0.0]])
     p = np.array([[5.0, 0.5, 0.0], [5.0, -0.3, 0.0], [5.0, 2.0, 0.0]])
