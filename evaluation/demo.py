@@ -34,9 +34,11 @@ def demo(
 
     Raises:
         MissingExtraError: without the packages of `covis[envs,learned]`.
+        OSError: no folder can be made there.
     """
     settings = Settings(preset=PRESET, seed=seed, episodes=EPISODES)
     require_scene(settings.perception)
+    out.mkdir(parents=True, exist_ok=True)
     from .gallery import Picture, correspondence_pictures
 
     methods = [Method.parse(name) for name in METHODS]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import zlib
 from contextlib import redirect_stdout
+from copy import deepcopy
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..fusion.sequence import PairTracker
-from ..matching import Matching, ObjectGraph, PriorRequiredError, RelativePose
+from ..matching import METHODS, Matching, ObjectGraph, PriorRequiredError, RelativePose
 from ..matching.pose import Array
 from .methods import Method, oracle, random_matching
 
@@ -82,6 +83,8 @@ def match_pair(
     if method.disturbance.rates():
         source, target = disturbed(method, source, target, stream)
         maps = None
+    if method.name not in METHODS:  # it may write into what it is given, and others come after it
+        source, target, prior, maps = deepcopy((source, target, prior, maps))
     start = perf_counter()
     try:
         with redirect_stdout(sys.stderr):  # standard output may be the rows'

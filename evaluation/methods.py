@@ -6,6 +6,7 @@ import ast
 import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -69,7 +70,13 @@ class Method:
         """The matcher, or None for `oracle` and `random`, which are none."""
         if self.name in EVALUATION_ONLY:
             return bayes if self.name == "oracle-pose" else None
-        return load_matcher(self.name)
+        return _loaded(self.name)
+
+
+@cache
+def _loaded(name: str) -> Matcher:
+    """Looking through installed packages takes longer than many a solve."""
+    return load_matcher(name)
 
 
 def oracle(source_identity: NDArray[np.int64], target_identity: NDArray[np.int64]) -> Matching:

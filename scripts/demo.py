@@ -17,11 +17,10 @@ def demo(
     seed: Annotated[int, typer.Option(help="Of scenes, eyes and matchers.")] = 0,
 ) -> None:
     """Scenes x methods, from pixels to displacement error: a table here, a report with pictures in a folder."""
-    folder.mkdir(parents=True, exist_ok=True)
     try:
         with progress_bar("demo") as progress:
             rows = run_demo(folder, seed, progress)
-    except (ValueError, RuntimeError) as error:
+    except (ValueError, RuntimeError, OSError) as error:
         fail(error)
     out.print(table(rows))
     out.print(f"Report with pictures: {folder / 'report.md'}")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from importlib import metadata
+from typing import Annotated
+
 import typer
 
 from .benchmark import benchmark
@@ -17,9 +20,15 @@ from .train import app as train
 from .tune import tune
 from .view import view
 
+
+def _version(asked: bool) -> None:
+    if asked:
+        print(f"covis {metadata.version('covis')}")
+        raise typer.Exit
+
+
 app = typer.Typer(
     name="covis",
-    help="Collaborative multi-robot perception: environments, matching, fusion, benchmark.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     add_completion=False,
@@ -37,6 +46,15 @@ app.command()(tune)
 app.add_typer(import_data, name="import")
 app.add_typer(export_data, name="export")
 app.add_typer(train, name="train")
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", help="The installed version.", is_eager=True, callback=_version)
+    ] = False,
+) -> None:
+    """Collaborative multi-robot perception: environments, matching, fusion, benchmark."""
 
 
 def main() -> None:

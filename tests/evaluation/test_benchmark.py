@@ -13,7 +13,7 @@ from covis.evaluation.datasets import DatasetError, load_dataset
 from covis.evaluation.methods import Method
 from covis.evaluation.settings import SCENE_NAMES, Settings
 from covis.evaluation.statistics import bootstrap_f1
-from covis.matching import Matching, PriorRequiredError, reid
+from covis.matching import Matching, PriorRequiredError, registry, reid
 from covis.matching.metrics import Counts
 
 METHODS = [Method.parse(m) for m in ("oracle", "hungarian:gate_m=1.5", "reid", "random")]
@@ -63,6 +63,18 @@ def fails_on_few(source, target, *, prior=None, rng=None):
     if len(source) < 7:
         raise ValueError(f"{len(source)} are too few")
     return reid(source, target)
+
+
+def scribbles(source, target, *, prior=None, rng=None):
+    source.positions[:] = 0.0
+    target.attributes[:] = 1.0
+    if prior is not None:
+        prior.T_source_target[:] = np.eye(4)
+    return Matching.empty()
+
+
+def finds_nothing(source, target, *, prior=None, rng=None):
+    return Matching.empty()
 
 
 def talks(source, target, *, prior=None, rng=None):
@@ -195,6 +207,21 @@ def test_a_matcher_that_fails_now_and_then_counts_where_it_does_not(small_datase
     assert 0 < now_and_then["n_failed"] < now_and_then["pairs"] == reid["pairs"]
     assert 0 < now_and_then["n_retrieved"] < reid["n_retrieved"]
     assert now_and_then["n_covisible"] == reid["n_covisible"]
+
+
+def test_a_matcher_that_writes_into_its_input_spoils_no_other(small_dataset):
+    first = Method.parse(f"{__name__}:scribbles")
+    for settings, others in ((Settings(pose="known"), METHODS[1:3]), (Settings(sequence=True), METHODS[2:3])):
+        alone = benchmark([str(small_dataset)], others, settings)
+        after = benchmark([str(small_dataset)], [first, *others], settings)[1:]
+        assert own_figures(after) == own_figures(alone)
+
+
+def test_installed_packages_are_looked_through_once(small_dataset, monkeypatch):
+    asked = []
+    monkeypatch.setattr(registry, "entry_points", lambda group: asked.append(group) or [])
+    benchmark([str(small_dataset)], [Method.parse(f"{__name__}:finds_nothing")], Settings())
+    assert len(asked) == 1
 
 
 def test_what_a_matcher_prints_goes_to_standard_error(small_dataset, capsys):

@@ -3,10 +3,12 @@
 import json
 import subprocess
 import sys
+from importlib import metadata
 
 import pytest
 from typer.testing import CliRunner
 
+from covis.evaluation import extras
 from covis.scripts.main import app
 
 runner = CliRunner()
@@ -40,6 +42,21 @@ def test_benchmark_writes_a_file_and_a_table(small_dataset, tmp_path):
     assert result.exit_code == 0, result.output
     assert "reid" in result.stdout
     assert json.loads(file.read_text())["rows"][0]["target"] == "small"
+
+
+def test_version():
+    assert runner.invoke(app, ["--version"]).output.split() == ["covis", metadata.version("covis")]
+
+
+def test_a_demo_that_cannot_run_leaves_nothing_behind(tmp_path, monkeypatch):
+    monkeypatch.setattr(extras, "find_spec", lambda module: None)
+    result = runner.invoke(app, ["demo", "--out", str(tmp_path / "demo")])
+    assert (result.exit_code, list(tmp_path.iterdir())) == (2, [])
+    monkeypatch.undo()
+    (tmp_path / "file").touch()
+    result = runner.invoke(app, ["demo", "--out", str(tmp_path / "file")])
+    assert result.exit_code == 2
+    assert "file" in result.stderr
 
 
 def test_datasets_of_one_name_are_told_apart(dataset_writer, tmp_path):
