@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 
 from . import weights as stored
@@ -23,10 +24,11 @@ class Kind:
 
     Attributes:
         params: its sizes from a dict, the other way round `to_dict`.
-        build: the network of such params; it keeps them as `params`.
+        build: the network of such params, in the memory format in which it learns fastest; it keeps them as `params`.
         losses: `(network, batch, weights, generator, *, bf16) -> {part: loss}`, their sum as `total`.
         perceptor: eyes with such a network.
         learning_rate: of AdamW, at its highest.
+        pairs: pairs of frames per batch.
         masks: training needs whole masks in its batches.
     """
 
@@ -35,6 +37,7 @@ class Kind:
     losses: Callable[..., dict[str, Tensor]]
     perceptor: type[LearnedPerception]
     learning_rate: float
+    pairs: int
     masks: bool = False
 
 
@@ -46,7 +49,14 @@ def kind(name: str) -> Kind:
         ImportError: `maskrcnn` without torchvision.
     """
     if name == "compact":
-        return Kind(lambda d: NetworkParams.from_dict(dict(d)), Eyes, losses, LearnedPerception, 1.5e-3)
+        return Kind(
+            lambda d: NetworkParams.from_dict(dict(d)),
+            lambda params: Eyes(params).to(memory_format=torch.channels_last),
+            losses,
+            LearnedPerception,
+            learning_rate=1.5e-3,
+            pairs=4,
+        )
     if name == "maskrcnn":
         try:
             from . import maskrcnn
@@ -57,7 +67,8 @@ def kind(name: str) -> Kind:
             maskrcnn.PaperNetwork,
             maskrcnn.losses,
             maskrcnn.MaskRCNNPerception,
-            3e-4,
+            learning_rate=3e-4,
+            pairs=1,  # an image costs seconds: many small steps rather than a few large ones
             masks=True,
         )
     raise ValueError(f"no network is called {name!r}; there are compact, maskrcnn")

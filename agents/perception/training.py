@@ -84,7 +84,7 @@ class _Book:
         self.began, self.before = time.monotonic(), state.seconds
         self.saved = self.validated = self.reported = state.seconds
         self.sums: dict[str, float] = {}
-        self.since = 0
+        self.since, self.seen = 0, state.images
 
     def enter(self, values: dict[str, float], done: float) -> None:
         """After every step."""
@@ -107,13 +107,12 @@ class _Book:
 
     def _report(self, done: float, over: bool) -> None:
         state, params = self.state, self.params
-        images = 2 * params.pairs * params.workers * self.since
         row: dict[str, Any] = {
             "step": state.step,
             "seconds": round(state.seconds, 1),
             "done": round(done, 4),
             "images": state.images,
-            "images_per_s": round(images / max(state.seconds - self.reported, 1e-9), 2),
+            "images_per_s": round((state.images - self.seen) / max(state.seconds - self.reported, 1e-9), 2),
             **{name: round(value / self.since, 5) for name, value in self.sums.items()},
         }
         if self.validate is not None and (over or state.seconds - self.validated >= params.validate_s):
@@ -122,7 +121,7 @@ class _Book:
             self.validated = state.seconds
         for log in self.logs:
             log(row)
-        self.reported, self.sums, self.since = state.seconds, {}, 0
+        self.reported, self.sums, self.since, self.seen = state.seconds, {}, 0, state.images
 
 
 def _json_logger(path: Path) -> Callable[[dict[str, Any]], None]:

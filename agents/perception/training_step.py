@@ -30,7 +30,7 @@ class TrainingParams:
         minutes: of wall time over all sessions, unless `steps` is given; the learning rate follows what has passed.
         steps: number of steps instead of a time.
         seed: of frames, batches, dropout and first weights.
-        pairs: pairs of frames per batch.
+        pairs: pairs of frames per batch; None = that of the network, see `kinds.Kind`.
         workers: processes that learn side by side.
         meet_every: steps between two averagings of the workers' weights.
         pool_chunks: chunks of frames kept at hand, by each worker.
@@ -49,7 +49,7 @@ class TrainingParams:
     minutes: float | None = 40.0
     steps: int | None = None
     seed: int = 0
-    pairs: int = 4
+    pairs: int | None = None
     workers: int = 1
     meet_every: int = 16
     pool_chunks: int = 60
@@ -96,13 +96,20 @@ class Pool:
         self.worker, self.workers = worker, workers
         self.chunks: dict[int, list[Pair]] = {}
 
-    def at(self, newest: int) -> list[Pair]:
-        """All pairs of the chunks up to number `newest`; the same whether the pool has just begun or run for long."""
-        wanted = range(newest - self.size + 1, newest + 1)
-        self.chunks = {
-            n: self.chunks[n] if n in self.chunks else self.source.chunk(n * self.workers + self.worker) for n in wanted
-        }
-        return [pair for n in wanted for pair in self.chunks[n]]
+    def draw(self, newest: int, number: int, rng: np.random.Generator) -> list[Pair]:
+        """Different pairs of the chunks up to number `newest`, as many as there are at most.
+
+        The same whether the pool has just begun or run for long; chunks are rendered when one of their pairs is drawn.
+        """
+        first, each = newest - self.size + 1, self.source.snapshots
+        self.chunks = {n: pairs for n, pairs in self.chunks.items() if n >= first}
+        drawn = rng.choice(self.size * each, min(number, self.size * each), replace=False)
+        return [self._chunk(first + int(i) // each)[int(i) % each] for i in drawn]
+
+    def _chunk(self, n: int) -> list[Pair]:
+        if n not in self.chunks:
+            self.chunks[n] = self.source.chunk(n * self.workers + self.worker)
+        return self.chunks[n]
 
 
 @dataclass
@@ -130,8 +137,8 @@ def fresh(params: TrainingParams, network: Any = None) -> State:
     network = network_params(params.network, joint_classes()) if network is None else network
     with torch.random.fork_rng():
         torch.manual_seed(params.seed)
-        net = build(network).to(memory_format=torch.channels_last)
-    averaged = build(network).to(memory_format=torch.channels_last)
+        net = build(network)
+    averaged = build(network)
     averaged.load_state_dict(net.state_dict())
     averaged.requires_grad_(False)
     return State(net, averaged, _optimiser(net, params))
@@ -146,9 +153,9 @@ def train_step(state: State, pool: Pool, params: TrainingParams, done: float, wo
     """One step; which frames, augmentations and dropout it uses follows from seed, step and worker alone."""
     rng = np.random.default_rng([params.seed, 17, state.step, worker])
     generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
-    pairs = pool.at(params.pool_chunks - 1 + state.step // params.steps_per_chunk)
-    chosen = [pairs[i] for i in rng.choice(len(pairs), min(params.pairs, len(pairs)), replace=False)]
     learner = kind(params.network)
+    newest = params.pool_chunks - 1 + state.step // params.steps_per_chunk
+    chosen = pool.draw(newest, params.pairs or learner.pairs, rng)
     batch = make_batch(chosen, rng, masks=learner.masks)
     for group in state.optimiser.param_groups:
         group["lr"] = (params.learning_rate or learner.learning_rate) * schedule(done, params.warm_up)

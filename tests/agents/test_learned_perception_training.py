@@ -148,7 +148,7 @@ def test_the_loss_falls_on_a_few_frames(pairs):
     kept = pairs
 
     class Fixed(Pool):
-        def at(self, newest):
+        def draw(self, newest, number, rng):
             return kept
 
     fixed = Fixed(pool.source, 1)
@@ -157,6 +157,30 @@ def test_the_loss_falls_on_a_few_frames(pairs):
     assert last < 0.7 * first
     for name in ("heat", "mask", "box", "classes"):
         assert np.mean([v[name] for v in values[-5:]]) < np.mean([v[name] for v in values[:5]])
+
+
+def test_a_pool_renders_what_is_drawn_and_draws_the_same_however_long_it_has_run():
+    rendered = []
+
+    class Counted(FrameSource):
+        def chunk(self, number):
+            rendered.append(number)
+            return [(number, i) for i in range(self.snapshots)]
+
+    pool = Pool(Counted(), 10, worker=1, workers=2)
+    draws = [pool.draw(9 + step, 3, np.random.default_rng(step)) for step in range(40)]
+    assert len(rendered) == len(set(rendered)) == len({chunk for draw in draws for chunk, _ in draw})
+    for step, draw in enumerate(draws):
+        assert len(set(draw)) == 3
+        assert all(chunk % 2 == 1 and step <= chunk // 2 <= 9 + step for chunk, _ in draw)
+        assert Pool(Counted(), 10, 1, 2).draw(9 + step, 3, np.random.default_rng(step)) == draw
+    assert len(set(Pool(Counted(), 2).draw(1, 100, np.random.default_rng(0)))) == 8
+
+
+def test_a_batch_is_as_large_as_suits_the_network():
+    state = fresh(quick(pairs=None, bf16=False), tiny())
+    train_step(state, Pool(FrameSource(variants=ROBOTS), 1), quick(pairs=None, pool_chunks=1, bf16=False), 0.1)
+    assert state.images == 8
 
 
 def test_resuming_gives_what_an_unbroken_training_gives(tmp_path):
