@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,8 +18,10 @@ import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torchvision.models import get_model
 from torchvision.models.detection import MaskRCNN
-from torchvision.models.detection.backbone_utils import resnet_fpn_backbone
+from torchvision.models.detection.anchor_utils import AnchorGenerator
+from torchvision.models.detection.backbone_utils import BackboneWithFPN
 from torchvision.models.detection.roi_heads import paste_masks_in_image
 from torchvision.ops import batched_nms, clip_boxes_to_image
 
@@ -33,6 +36,11 @@ STRIDE = 4
 """Of the features from which depth is read."""
 CHANNELS = 256
 """Of torchvision's feature pyramid."""
+GROUPS = 32
+"""Of group normalisation."""
+ANCHORS_PX = (12, 24, 48, 96, 192)
+"""At strides 4 to 64: half of the objects are less than 20 px across, where torchvision's own anchors begin at 32."""
+ASPECTS = (0.5, 1.0, 2.0)
 NMS_IOU = 0.5
 CENTRE_STD = 0.1
 """1 sigma of the projected centre before calibration, in sizes of the box."""
@@ -46,7 +54,7 @@ class MaskRCNNParams:
         classes: names, in the order of the class head (which has the background before them).
         backbone: of torchvision's ResNets, for detection and for depth.
         image_size: (width, height) at which the network looks; other images are scaled to it.
-        proposals: regions that reach the box head of one image.
+        proposals: regions that reach the box head of one image; in training half of them are learned from.
         representation: width of the box head.
         dropout: rate in the box head and in the depth head.
     """
@@ -136,20 +144,30 @@ class PaperNetwork(nn.Module):
             max_size=max(width, height),
             image_mean=[0.5] * 3,
             image_std=[0.5] * 3,
+            rpn_anchor_generator=AnchorGenerator(tuple((a,) for a in ANCHORS_PX), (ASPECTS,) * len(ANCHORS_PX)),
             rpn_pre_nms_top_n_test=4 * params.proposals,
             rpn_post_nms_top_n_test=params.proposals,
             rpn_post_nms_top_n_train=4 * params.proposals,
+            box_batch_size_per_image=params.proposals // 2,
         )
         self.detector.roi_heads.box_head = BoxHead(params.representation, params.dropout)
         predictor = self.detector.roi_heads.box_predictor
         for layer in ("cls_score", "bbox_pred"):
             setattr(predictor, layer, nn.Linear(params.representation, getattr(predictor, layer).out_features))
+        nn.init.normal_(self.detector.roi_heads.mask_predictor.mask_fcn_logits.weight, std=0.001)
         self.depth = DepthNetwork(params.backbone, params.dropout)
 
 
 def _pyramid(backbone: str) -> nn.Module:
-    # Batch normalisation learns here: torchvision freezes it by default, for weights that were trained elsewhere.
-    return resnet_fpn_backbone(backbone_name=backbone, weights=None, norm_layer=nn.BatchNorm2d, trainable_layers=5)
+    """Pyramid whose every convolution is normalised: from nothing, features that grow with depth never settle.
+
+    By groups, not batches: a batch is one pair of views of one scene, and its statistics are no guide to another's.
+    """
+    norm = partial(nn.GroupNorm, GROUPS)
+    body = get_model(backbone, weights=None, norm_layer=norm, zero_init_residual=True)
+    stages = {f"layer{i + 1}": str(i) for i in range(4)}
+    widths = [body.inplanes // 8 * 2**i for i in range(4)]
+    return BackboneWithFPN(body, stages, widths, CHANNELS, norm_layer=norm)
 
 
 def losses(
@@ -160,7 +178,7 @@ def losses(
     All in float32, whatever `bf16` says: torchvision's pooling of regions knows nothing else on a CPU.
     """
     assert batch.masks is not None
-    images = batch.images.permute(0, 3, 1, 2).float() / 255
+    images = batch.images.permute(0, 3, 1, 2).contiguous().float() / 255
     targets = [
         {
             "boxes": batch.boxes[batch.image == i],
@@ -249,7 +267,8 @@ class MaskRCNNPerception(LearnedPerception):
         boxes = clip_boxes_to_image(moved[torch.arange(len(label)), label], scaled.image_sizes[0])
         keep = batched_nms(boxes, scores, torch.zeros_like(label), NMS_IOU)
         keep = keep[scores[keep] >= p.score][: p.candidates]
-        masks = self._masks(features, boxes[keep], label[keep], scaled.image_sizes[0], image.shape[1:])
+        likely = self._masks(features, boxes[keep], label[keep], scaled.image_sizes[0], image.shape[1:])
+        masks = apart(likely, scores[keep])
         seen = masks.sum((1, 2)) >= p.min_pixels
         keep, masks = keep[seen], masks[seen]
         attributes, v = class_uncertainty(
@@ -260,17 +279,15 @@ class MaskRCNNPerception(LearnedPerception):
     def _masks(
         self, features: dict[str, Tensor], boxes: Tensor, label: Tensor, seen: tuple[int, int], size: Any
     ) -> Tensor:
-        """Masks (n, H, W) bool; a pixel that several claim goes to the surest."""
+        """How likely each pixel is to be of each object (n, H, W)."""
         height, width = size
         if len(boxes) == 0:
-            return torch.zeros((0, height, width), dtype=torch.bool)
+            return torch.zeros((0, height, width))
         roi = self.network.detector.roi_heads
         logits = roi.mask_predictor(roi.mask_head(roi.mask_roi_pool(features, [boxes], [seen])))
         small = torch.sigmoid(logits[torch.arange(len(label)), label])[:, None]
         scale = torch.tensor([width / seen[1], height / seen[0]]).repeat(2)
-        full = paste_masks_in_image(small, boxes * scale, (height, width))[:, 0]
-        owner = full.argmax(0)
-        return (full > 0.5) & (owner == torch.arange(len(label))[:, None, None])
+        return paste_masks_in_image(small, boxes * scale, (height, width))[:, 0]
 
     def _object_depths(
         self, image: Tensor, at: Tensor, focal: float, generator: torch.Generator
@@ -283,6 +300,19 @@ class MaskRCNNPerception(LearnedPerception):
         seen = bilinear(maps, torch.zeros(n * D, dtype=torch.int64), at.reshape(-1, 2), STRIDE)
         log_depth, log_variance = self.network.depth.read(seen, T > 1, generator, T)
         return depth_uncertainty(log_depth.view(T, n, D), log_variance.view(T, n, D), focal)
+
+
+def apart(likely: Tensor, scores: Tensor) -> Tensor:
+    """Masks (n, H, W) bool of objects as likely at each pixel as (n, H, W) says, none on another.
+
+    A pixel that several claim goes to the surest, by mask and by detection: what is hardly an object takes nothing
+    away from one that is.
+    """
+    claimed = likely > 0.5
+    if len(likely) == 0:
+        return claimed
+    owner = torch.where(claimed, likely * scores[:, None, None], 0.0).argmax(0)
+    return claimed & (owner == torch.arange(len(likely))[:, None, None])
 
 
 def _centroids(masks: NDArray[np.bool_]) -> Array:
