@@ -12,7 +12,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from pettingzoo.test import parallel_api_test
 
-import covis.agents  # noqa: F401 - enters the scenes in Gymnasium's registry
+import covis.agents  # enters the scenes in Gymnasium's registry
 from covis.agents.gymnasium_registry import VERSIONS, gymnasium_id
 from covis.agents.localizer import Localizer
 from covis.agents.perception import make_perceptor
@@ -20,6 +20,12 @@ from covis.agents.wrapper import LocalizeWrapper
 from covis.envs.scenes import SCENES, parallel_env
 
 SMALL = {"width": 96, "height": 72, "max_detections": 8, "max_cycles": 4}
+
+
+def test_it_comes_from_the_package():
+    assert covis.agents.LocalizeWrapper is LocalizeWrapper
+    with pytest.raises(AttributeError, match=r"'covis.agents' has no attribute 'Nobody'"):
+        _ = covis.agents.Nobody
 
 
 def make(seed=None, slots=None):
