@@ -30,7 +30,7 @@ def plan(targets: Sequence[str], methods: Sequence[Method], settings: Settings) 
         ValueError: a target that is none of them.
         MissingExtraError: a scene without the packages it needs.
     """
-    texts = tuple(method.label for method in methods)
+    texts = tuple(dict.fromkeys(method.label for method in methods))
     experiments = []
     for target in dict.fromkeys(targets):
         if target in SCENE_NAMES or (":" in target and not Path(target).exists()):
@@ -54,7 +54,7 @@ def benchmark(
 
     Args:
         targets: see `plan`.
-        methods: see `covis.evaluation.methods`.
+        methods: see `covis.evaluation.methods`; one that is given twice runs once.
         settings: options of the run.
         how: see `run_experiments`.
 

@@ -76,7 +76,7 @@ def prior_between(source: View, target: View) -> RelativePose:
 
 def _known_pose(view: View) -> tuple[Array, Array]:
     if view.pose is None or view.pose_covariance is None:
-        raise DatasetError(f"{view.robot} has no pose in this frame, so poses cannot be 'known'")
+        raise DatasetError(f"{view.robot} has no pose, so poses cannot be 'known'")
     return view.pose, view.pose_covariance
 
 

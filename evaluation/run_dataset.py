@@ -13,7 +13,7 @@ from ..matching import Matching
 from ..matching.metrics import Counts, is_correct
 from .dataset_errors import Matched, fused, with_errors
 from .dataset_pages import page, shared
-from .datasets import Dataset, Frame, View, prior_between, true_relative_pose
+from .datasets import Dataset, DatasetError, Frame, View, prior_between, true_relative_pose
 from .matching_run import PairTruth, attempt
 from .methods import Method
 from .pictures import PictureBook
@@ -89,9 +89,12 @@ def _match_all(
 ) -> Iterator[Matched]:
     """What each method makes of a pair of views."""
     frame, source, target = pair
-    prior = prior_between(source, target) if settings.pose == "known" else None
     truth = PairTruth((source.identity, target.identity), true_relative_pose(source, target))
     where = f"{name}, frame {frame.index}, {source.robot} and {target.robot}"
+    try:
+        prior = prior_between(source, target) if settings.pose == "known" else None
+    except DatasetError as error:
+        raise DatasetError(f"{where}: {error}") from error
     a, b = frame.views.index(source), frame.views.index(target)
     number = a * len(frame.views) + b
     for method in methods:

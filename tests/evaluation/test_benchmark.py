@@ -107,6 +107,11 @@ def test_rows_have_the_documented_fields_and_order(small_dataset):
     json.dumps(rows, allow_nan=False)
 
 
+def test_a_method_given_twice_runs_once(small_dataset):
+    once = benchmark([str(small_dataset)], METHODS[:1], Settings())
+    assert without_time(benchmark([str(small_dataset)] * 2, METHODS[:1] * 2, Settings())) == without_time(once)
+
+
 def test_min_common_leaves_pairs_out(small_dataset):
     dataset = load_dataset(small_dataset)
     common = []
@@ -171,7 +176,7 @@ def test_a_method_that_needs_a_prior_says_so(small_dataset):
 def test_known_poses_need_poses(tmp_path, small_dataset):
     table = pq.read_table(small_dataset / "robots.parquet").drop_columns(["pose"])
     pq.write_table(table, small_dataset / "robots.parquet")
-    with pytest.raises(DatasetError, match="has no pose in this frame"):
+    with pytest.raises(DatasetError, match="small, frame 0, robot_0 and robot_1: robot_0 has no pose, so"):
         benchmark([str(small_dataset)], METHODS[:1], Settings(pose="known"))
 
 
