@@ -6,7 +6,7 @@ everything else over detections whose mask meets a true object's with IoU >= 0.5
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -71,7 +71,7 @@ def perception_benchmark(
         rows.append(row(target, tallies[target]) | {"images": tallies[target].images, "seed": seed} | computed)
         known = PerceptionTarget(target.scene)
         if target.ood and known in tallies:
-            rows[-1] |= shift(tallies[known], tallies[target])
+            rows[-1] |= {"known_ap50": rows[targets.index(known)]["ap50"]} | shift(tallies[known], tallies[target])
     return rows
 
 
@@ -117,7 +117,9 @@ def row(target: PerceptionTarget, found: Tally) -> dict[str, Any]:
         "depth_only_spearman": spearman(found.of("distance"), squared),
         "ence": ence(u, squared),
         "u_mean_m2": _mean(u),
+        "u_epistemic_mean_m2": _mean(found.of("u_epistemic")),
         "v_mean": _mean(found.of("v")),
+        "v_epistemic_mean": _mean(found.of("v_epistemic")),
         "squared_error_mean_m2": _mean(squared),
         "lateral_mean_m": _mean(np.linalg.norm(found.of("offset").reshape(-1, 3)[:, 1:], axis=1)),
         **consistency(found),
@@ -170,7 +172,7 @@ def consistency(found: Tally) -> dict[str, float | None]:
 
 
 def shift(known: Tally, strange: Tally) -> dict[str, float | None]:
-    """How much u, v and the squared errors rise out of distribution, among objects matched in range and size.
+    """How much u, v, their parts and the squared errors rise out of distribution, objects matched in range and size.
 
     Objects fall into bins a third of an octave of range by an octave of visible pixels; each bin counts by the smaller
     of its two numbers. Ratios of weighted means, strange over known.
@@ -179,10 +181,11 @@ def shift(known: Tally, strange: Tally) -> dict[str, float | None]:
         np.stack([np.floor(3 * np.log2(t.of("true_distance"))), np.floor(np.log2(t.of("size")))], axis=1)
         for t in (known, strange)
     ]
-    names = ("u_ratio_matched", "v_ratio_matched", "squared_error_ratio_matched")
+    values = [_shifting(t) for t in (known, strange)]
+    names = [f"{name}_ratio_matched" for name in values[0]]
     out: dict[str, float | None] = dict.fromkeys(names) | {"matched_objects": 0}
     keys = np.unique(np.concatenate(bins), axis=0)
-    sums = np.zeros((2, 3))
+    sums = np.zeros((2, len(names)))
     total = 0.0
     for key in keys:
         chosen = [(b == key).all(axis=1) for b in bins]
@@ -190,12 +193,19 @@ def shift(known: Tally, strange: Tally) -> dict[str, float | None]:
         if weight == 0:
             continue
         total += weight
-        for side, (t, c) in enumerate(zip((known, strange), chosen, strict=True)):
-            sums[side] += weight * np.array([values[c].mean() for values in (t.of("u"), t.of("v"), t.of("error") ** 2)])
-    if total and (sums[0] > 0).all():
-        ratio = sums[1] / sums[0]
-        out |= dict(zip(names, ratio.tolist(), strict=True)) | {"matched_objects": int(total)}
+        for side, c in enumerate(chosen):
+            sums[side] += weight * np.array([x[c].mean() for x in values[side].values()])
+    if total:
+        ratios = [b / a if a > 0 else None for a, b in sums.T.tolist()]
+        out |= dict(zip(names, ratios, strict=True)) | {"matched_objects": int(total)}
     return out
+
+
+def _shifting(found: Tally) -> dict[str, Array]:
+    """What `shift` compares, by name."""
+    parts = {name: found.of(name) for name in ("u", "u_epistemic", "v", "v_epistemic")}
+    parts |= {f"{name}_aleatoric": parts[name] - parts[f"{name}_epistemic"] for name in ("u", "v")}
+    return parts | {"squared_error": found.of("error") ** 2}
 
 
 def _mean(values: Array) -> float | None:
@@ -206,7 +216,7 @@ def _ratio(part: int, whole: int) -> float | None:
     return part / whole if whole else None
 
 
-def table_columns() -> Iterable[tuple[str, str]]:
+def table_columns() -> Sequence[tuple[str, str]]:
     """Keys and titles of the figures worth a column."""
     return (
         ("target", "target"),
@@ -219,7 +229,20 @@ def table_columns() -> Iterable[tuple[str, str]]:
         ("depth_only_spearman", "rho(z)"),
         ("ence", "ENCE"),
         ("nees", "NEES"),
+    )
+
+
+def shift_columns() -> Sequence[tuple[str, str]]:
+    """Keys and titles of how targets out of distribution compare with the known scene."""
+    return (
+        ("target", "out of distribution"),
+        ("ap50", "AP50"),
+        ("known_ap50", "known"),
         ("u_ratio_matched", "u ratio"),
-        ("v_ratio_matched", "v ratio"),
+        ("u_epistemic_ratio_matched", "epistemic"),
+        ("u_aleatoric_ratio_matched", "aleatoric"),
         ("squared_error_ratio_matched", "e² ratio"),
+        ("v_ratio_matched", "v ratio"),
+        ("v_epistemic_ratio_matched", "epistemic"),
+        ("v_aleatoric_ratio_matched", "aleatoric"),
     )

@@ -40,10 +40,11 @@ class Tally:
         depth_ratio: (k,) estimated over true depth.
         offset: (k, 3) m, true minus estimated position along the viewing ray and across it, to the right and down.
         variances: (k, 3) m^2, reported variances of these.
-        u, v: (k,) reported uncertainties.
+        u, v: (k,) reported uncertainties; `u_epistemic`, `v_epistemic` their parts that are variance between samples.
         attributes, true_class: (k, c), (k,).
         size: (k,) visible pixels.
         features: (k, TERMS) of which the calibration is a function.
+        backbone: (k, d) features of the network, where its eyes give them.
         milliseconds: per image.
     """
 
@@ -61,10 +62,13 @@ class Tally:
     variances: list[Array] = field(default_factory=list)
     u: list[Array] = field(default_factory=list)
     v: list[Array] = field(default_factory=list)
+    u_epistemic: list[Array] = field(default_factory=list)
+    v_epistemic: list[Array] = field(default_factory=list)
     attributes: list[Array] = field(default_factory=list)
     true_class: list[NDArray[np.int64]] = field(default_factory=list)
     size: list[Array] = field(default_factory=list)
     features: list[Array] = field(default_factory=list)
+    backbone: list[Array] = field(default_factory=list)
     milliseconds: list[float] = field(default_factory=list)
     coco: CocoRecords = field(default_factory=lambda: CocoRecords())
 
@@ -142,9 +146,13 @@ def count(out: Tally, image: Image, seen: Seen, score: float) -> None:
     out.variances.append(np.einsum("nki,nij,nkj->nk", frames, graph.full_covariances(), frames))
     out.u.append(graph.position_variance)
     out.v.append(graph.attribute_variance)
+    out.u_epistemic.append(graph.position_variance * (seen.depth_epistemic / seen.depth_variance)[found])
+    out.v_epistemic.append(seen.attribute_epistemic[found])
     out.attributes.append(graph.attributes)
     out.true_class.append(image.object_class[true])
     out.features.append(seen.features[found])
+    if seen.backbone is not None:
+        out.backbone.append(seen.backbone[found])
     out.size.append(image.pixels[true].astype(np.float64))
 
 

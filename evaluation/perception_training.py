@@ -75,7 +75,9 @@ def _calibrated(weights: Weights, images: int) -> Weights:
     if not images:
         return replace(weights, notes=notes)
     calibration = calibrate([found for _, found in _tallies(weights, images, 1)])
-    return replace(weights, calibration=calibration, notes=notes)
+    # What was seen had been divided by the temperature that the weights came with.
+    temperature = calibration.class_temperature * weights.calibration.class_temperature
+    return replace(weights, calibration=replace(calibration, class_temperature=temperature), notes=notes)
 
 
 def training_notes(state: State, params: TrainingParams) -> dict[str, Any]:
@@ -95,9 +97,10 @@ def calibrate(tallies: Sequence[Tally]) -> Calibration:
 
     Of all detections that meet a true object, scenes counting alike; those with too few detections are left out. The
     correction of the depth has the least absolute logarithmic error; those of the variances make the errors most
-    likely, see `_variance_correction`; the temperature has the least negative log-likelihood of the true classes.
+    likely, see `_variance_correction`; the temperature, relative to that with which they saw, has the least negative
+    log-likelihood of the true classes.
     """
-    from ..agents.perception.weights import Calibration
+    from ..agents.perception.weights import Calibration, Familiar, with_strangeness
 
     used = [t for t in tallies if len(t.of("u", every=True)) >= SMALLEST_TALLY]
     if not used:
@@ -105,6 +108,11 @@ def calibrate(tallies: Sequence[Tally]) -> Calibration:
     share = np.concatenate([np.full(n, 1 / (n * len(used))) for n in (len(t.of("u", every=True)) for t in used)])
     names = ("features", "distance", "offset", "variances")
     features, distance, offset, variances = (np.concatenate([t.of(name, every=True) for t in used]) for name in names)
+    familiar = None
+    if all(t.backbone for t in used):
+        backbone = np.concatenate([t.of("backbone", every=True) for t in used])
+        familiar = Familiar.of(backbone, share)
+        features = with_strangeness(features, familiar.strangeness(backbone))
     depth = _depth_correction(features, np.log(np.maximum(1 + offset[:, 0] / distance, SMALLEST_RATIO)), share)
     factor = np.exp(features @ depth)
     offset[:, 0] += (1 - factor) * distance
@@ -118,6 +126,7 @@ def calibrate(tallies: Sequence[Tally]) -> Calibration:
         horizontal=tuple(horizontal.tolist()),
         vertical=tuple(vertical.tolist()),
         class_temperature=float(temperatures[int(np.argmin(surprise))]),
+        familiar=familiar,
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -134,7 +134,13 @@ def _perception(
     json_target: str | None,
 ) -> None:
     """`covis benchmark perception`: learned eyes alone, on test scenes."""
-    from ..evaluation.perception_benchmark import IMAGES, perception_benchmark, table_columns, weights_of
+    from ..evaluation.perception_benchmark import (
+        IMAGES,
+        perception_benchmark,
+        shift_columns,
+        table_columns,
+        weights_of,
+    )
 
     try:
         if targets != ["perception"]:
@@ -157,13 +163,19 @@ def _perception(
         fail(error)
     write_rows(rows, json_target)
     if json_target != "-":
-        view = Table(header_style="bold")
-        for key, title in table_columns():
-            view.add_column(title, justify="left" if key == "target" else "right")
-        for row in rows:
-            cells = (row.get(key) for key, _ in table_columns())
-            view.add_row(*(c if isinstance(c, str) else "" if c is None else f"{c:.3f}" for c in cells))
-        out.print(view)
+        out.print(_figures(rows, table_columns()))
+        out.print(_figures([row for row in rows if "known_ap50" in row], shift_columns()))
+
+
+def _figures(rows: list[dict[str, Any]], columns: Sequence[tuple[str, str]]) -> Table:
+    """Rows as a table of these keys and titles."""
+    view = Table(header_style="bold")
+    for key, title in columns:
+        view.add_column(title, justify="left" if key == "target" else "right")
+    for row in rows:
+        cells = (row.get(key) for key, _ in columns)
+        view.add_row(*(c if isinstance(c, str) else "" if c is None else f"{c:.3f}" for c in cells))
+    return view
 
 
 def default_methods(settings: Settings) -> list[str]:

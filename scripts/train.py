@@ -38,8 +38,8 @@ def perception(
 ) -> None:
     """Learn to see objects, their classes and distances, from frames of the four scenes rendered on the fly.
 
-    Killed at any time, the same command with --resume goes on. The weights come to OUT/eyes.safetensors and
-    OUT/eyes.json.
+    Killed at any time, the same command with --resume goes on. The weights come to OUT/eyes.safetensors,
+    OUT/eyes.json and OUT/familiar.safetensors.
     """
     try:
         require("envs")

@@ -21,7 +21,9 @@ from ...matching.pose import Array
 from . import weights as stored
 from .decode import draw_masks, find_peaks, full_masks, mask_quality, spread_pixels, suppress
 from .detections import Detections, ray_covariances, rays
+from .losses import iou
 from .network import (
+    CENTRE_GEOMETRY,
     FINE_STRIDE,
     REFERENCE_FOCAL_PX,
     DenseFeatures,
@@ -86,7 +88,9 @@ class Seen:
         depth: (n,) m, of each object's centre along the optical axis.
         depth_variance: (n,) m^2 of that, calibrated; the sum of epistemic and aleatoric.
         depth_epistemic: (n,) m^2, the variance between samples, calibrated alike.
+        attribute_epistemic: (n,) the part of v that is variance between samples.
         features: (n, weights.TERMS) of which the calibration is a function.
+        backbone: (n, d) features of the network at the objects, or None.
         milliseconds: time per stage.
     """
 
@@ -96,7 +100,9 @@ class Seen:
     depth: Array
     depth_variance: Array
     depth_epistemic: Array
+    attribute_epistemic: Array
     features: Array
+    backbone: Array | None
     milliseconds: Mapping[str, float]
 
 
@@ -125,12 +131,15 @@ class Objects:
     Attributes:
         scores, pixels, masks (n, H, W): see `Seen`.
         tight: (n, 4) px, boxes of the masks.
-        attributes: (n, c) class distributions, Eq. (6); attribute_variance (n,), section 3.3.1.
+        attributes: (n, c) class distributions, Eq. (6); attribute_variance (n,), section 3.3.1, and its epistemic part.
         pixel: (n, 2) where the centre projects to.
         size: (n, 2) px, width and height of the box that the network gives.
         centre_variance: (n,) of `pixel` per axis, in squares of the size along it.
         depth, depth_variance, depth_epistemic: (n,) m and m^2.
+        depth_spread: (n,) variance of the log depth between the pixels of the mask.
+        box_overlap: (n,) IoU of the box that the network gives with `tight`.
         embedding: (n, e), or None.
+        backbone: (n, d) features at the centres, or None.
     """
 
     scores: Array
@@ -139,13 +148,17 @@ class Objects:
     tight: Array
     attributes: Array
     attribute_variance: Array
+    attribute_epistemic: Array
     pixel: Array
     size: Array
     centre_variance: Array
     depth: Array
     depth_variance: Array
     depth_epistemic: Array
+    depth_spread: Array
+    box_overlap: Array
     embedding: Array | None = None
+    backbone: Array | None = None
 
 
 class LearnedPerception:
@@ -224,9 +237,9 @@ class LearnedPerception:
         clock.lap("backbone")
         found = self._find(dense, geometry, rows, columns)
         clock.lap("masks")
-        attributes, v = self._classify(found.features, generator)
+        attributes, v, v_epistemic = self._classify(found.features, generator)
         clock.lap("classes")
-        depth, variance, epistemic = self._depths(dense, geometry, found, generator)
+        depth, variance, epistemic, spread = self._depths(dense, geometry, found, generator)
         clock.lap("depth")
         size = (found.boxes[:, 2:] - found.boxes[:, :2]).clamp(min=2.0)
         return Objects(
@@ -236,17 +249,24 @@ class LearnedPerception:
             tight=found.tight,
             attributes=attributes,
             attribute_variance=v,
+            attribute_epistemic=v_epistemic,
             pixel=(found.at + found.centre * size).double().numpy(),
             size=size.double().numpy(),
             centre_variance=np.exp(found.centre_log_variance.double().numpy()),
             depth=depth,
             depth_variance=variance,
             depth_epistemic=epistemic,
+            depth_spread=spread,
+            box_overlap=iou(found.boxes, torch.from_numpy(found.tight)).double().numpy(),
             embedding=found.embedding.double().numpy(),
+            backbone=found.features[:, :-CENTRE_GEOMETRY].double().numpy(),
         )
 
     def _calibrated(self, found: Objects, view: View) -> Seen:
         """Depths and uncertainties as validation scenes have shown that they should be."""
+        familiar, strangeness = self.calibration.familiar, np.ones(len(found.depth))
+        if familiar is not None and found.backbone is not None:
+            strangeness = familiar.strangeness(found.backbone)
         features = stored.calibration_features(
             depth=found.depth,
             depth_variance=found.depth_variance,
@@ -254,6 +274,10 @@ class LearnedPerception:
             centre_variance=found.centre_variance,
             confidence=found.scores,
             size=found.size,
+            class_epistemic=found.attribute_epistemic,
+            depth_spread=found.depth_spread,
+            box_overlap=found.box_overlap,
+            strangeness=strangeness,
         )
         nearer, along, *axes = self.calibration.factors(features).T
         depth, factor = found.depth * nearer, along * nearer**2
@@ -281,7 +305,9 @@ class LearnedPerception:
             depth=depth,
             depth_variance=factor * found.depth_variance,
             depth_epistemic=factor * found.depth_epistemic,
+            attribute_epistemic=found.attribute_epistemic,
             features=features,
+            backbone=found.backbone,
             milliseconds={},
         )
 
@@ -342,8 +368,8 @@ class LearnedPerception:
             tight=tight[seen],
         )
 
-    def _classify(self, features: Tensor, generator: torch.Generator) -> tuple[Array, Array]:
-        """Class distributions (n, c), Eq. (6), and their uncertainty v (n,), section 3.3.1."""
+    def _classify(self, features: Tensor, generator: torch.Generator) -> tuple[Array, Array, Array]:
+        """Class distributions (n, c), Eq. (6), their uncertainty v (n,), section 3.3.1, and its epistemic part."""
         T = self.params.samples
         sampled = features.expand(T, *features.shape)
         logits = self.network.class_logits(sampled, T > 1, generator)[..., self._class_index]
@@ -351,11 +377,13 @@ class LearnedPerception:
 
     def _depths(
         self, dense: DenseFeatures, geometry: Geometry, found: _Found, generator: torch.Generator
-    ) -> tuple[Array, Array, Array]:
-        """Depth (n,) m as mean over each mask, its variance (n,) as mean over its pixels, and the epistemic part."""
+    ) -> tuple[Array, Array, Array, Array]:
+        """Depth (n,) m as mean over each mask, its variance (n,) as mean over its pixels, the epistemic part, and
+        how the log depth varies between pixels (n,).
+        """
         n, T, D = len(found.scores), self.params.samples, self.params.depth_pixels
         if n == 0:
-            return np.zeros(0), np.zeros(0), np.zeros(0)
+            return np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0)
         pixels = torch.from_numpy(spread_pixels(found.masks, found.pixels, found.tight, D))
         image = torch.zeros(n * D, dtype=torch.int64)
         box = found.boxes[:, None].expand(n, D, 4).reshape(-1, 4)
@@ -364,21 +392,26 @@ class LearnedPerception:
         return depth_uncertainty(log_depth.view(T, n, D), log_variance.view(T, n, D), float(geometry.focal[0]))
 
 
-def depth_uncertainty(log_depth: Tensor, log_variance: Tensor, focal: float) -> tuple[Array, Array, Array]:
-    """Depth (n,) m, its variance (n,) m^2, section 3.3.2, and the epistemic part of that, of samples (T, n, pixels)."""
+def depth_uncertainty(log_depth: Tensor, log_variance: Tensor, focal: float) -> tuple[Array, Array, Array, Array]:
+    """Depth (n,) m, its variance (n,) m^2, section 3.3.2, the epistemic part of that, and the variance (n,) of the log
+    depth between pixels, of samples (T, n, pixels).
+    """
     z = focal / REFERENCE_FOCAL_PX * torch.exp(log_depth.double())
     aleatoric = (z**2 * torch.exp(log_variance.double())).mean((0, 2)).numpy()
     epistemic = z.var(0, unbiased=False).mean(1).numpy()
-    return z.mean((0, 2)).numpy(), aleatoric + epistemic, epistemic
+    spread = log_depth.double().mean(0).var(1, unbiased=False).numpy()
+    return z.mean((0, 2)).numpy(), aleatoric + epistemic, epistemic, spread
 
 
-def class_uncertainty(logits: Tensor, temperature: float) -> tuple[Array, Array]:
-    """Class distributions (n, c), Eq. (6), and their uncertainty v (n,), section 3.3.1, of samples (T, n, c)."""
+def class_uncertainty(logits: Tensor, temperature: float) -> tuple[Array, Array, Array]:
+    """Class distributions (n, c), Eq. (6), their uncertainty v (n,), section 3.3.1, and the epistemic part of that, of
+    samples (T, n, c).
+    """
     p = torch.softmax(logits / temperature, dim=2).double().numpy()
     mean = p.mean(axis=0)  # Eq. (6)
-    epistemic = p.var(axis=0)
-    aleatoric = (p * (1 - p)).mean(axis=0)
-    return mean / mean.sum(axis=1, keepdims=True), (epistemic + aleatoric).mean(axis=1)
+    epistemic = p.var(axis=0).mean(axis=1)
+    aleatoric = (p * (1 - p)).mean(axis=(0, 2))
+    return mean / mean.sum(axis=1, keepdims=True), epistemic + aleatoric, epistemic
 
 
 def finite(observation: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Array:

@@ -225,11 +225,11 @@ class MaskRCNNPerception(LearnedPerception):
 
     def _objects(self, view: View, generator: torch.Generator, clock: Clock) -> Objects:
         pixels = torch.from_numpy(view.image).permute(2, 0, 1).float() / 255
-        scores, masks, attributes, v = self._detect(pixels, generator)
+        scores, masks, attributes, v, v_epistemic = self._detect(pixels, generator)
         tight, visible = tight_boxes(masks), masks.sum(axis=(1, 2))
         clock.lap("objects")
         at = torch.from_numpy(spread_pixels(masks, visible, tight, self.params.depth_pixels))
-        depth, variance, epistemic = self._object_depths(pixels, at, float(view.intrinsics[0, 0]), generator)
+        depth, variance, epistemic, spread = self._object_depths(pixels, at, float(view.intrinsics[0, 0]), generator)
         clock.lap("depth")
         return Objects(
             scores=scores,
@@ -238,16 +238,21 @@ class MaskRCNNPerception(LearnedPerception):
             tight=tight,
             attributes=attributes,
             attribute_variance=v,
+            attribute_epistemic=v_epistemic,
             pixel=_centroids(masks),
             size=tight[:, 2:] - tight[:, :2],
             centre_variance=np.full(len(masks), CENTRE_STD**2),
             depth=depth,
             depth_variance=variance,
             depth_epistemic=epistemic,
+            depth_spread=spread,
+            box_overlap=np.ones(len(masks)),
         )
 
-    def _detect(self, image: Tensor, generator: torch.Generator) -> tuple[Array, NDArray[np.bool_], Array, Array]:
-        """Confidence (n,), mask (n, H, W), class distribution (n, c) and its uncertainty (n,) of the objects."""
+    def _detect(
+        self, image: Tensor, generator: torch.Generator
+    ) -> tuple[Array, NDArray[np.bool_], Array, Array, Array]:
+        """Confidence (n,), mask (n, H, W), class distribution (n, c), its uncertainty (n,), epistemic part of that."""
         detector, p = self.network.detector, self.params
         roi = detector.roi_heads
         scaled, _ = detector.transform([image])
@@ -271,10 +276,10 @@ class MaskRCNNPerception(LearnedPerception):
         masks = apart(likely, scores[keep])
         seen = masks.sum((1, 2)) >= p.min_pixels
         keep, masks = keep[seen], masks[seen]
-        attributes, v = class_uncertainty(
+        attributes, v, v_epistemic = class_uncertainty(
             logits.view(T, len(proposals), -1)[:, keep][..., 1 + self._class_index], self.calibration.class_temperature
         )
-        return scores[keep].double().numpy(), masks.numpy(), attributes, v
+        return scores[keep].double().numpy(), masks.numpy(), attributes, v, v_epistemic
 
     def _masks(
         self, features: dict[str, Tensor], boxes: Tensor, label: Tensor, seen: tuple[int, int], size: Any
@@ -291,11 +296,11 @@ class MaskRCNNPerception(LearnedPerception):
 
     def _object_depths(
         self, image: Tensor, at: Tensor, focal: float, generator: torch.Generator
-    ) -> tuple[Array, Array, Array]:
-        """As `LearnedPerception` does it, at pixels (n, D, 2): mean, variance as mean over pixels, epistemic part."""
+    ) -> tuple[Array, Array, Array, Array]:
+        """As `LearnedPerception` does it, at pixels (n, D, 2)."""
         (n, D), T = at.shape[:2], self.params.samples
         if n == 0:
-            return np.zeros(0), np.zeros(0), np.zeros(0)
+            return np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0)
         maps = self.network.depth(2 * image[None] - 1)
         seen = bilinear(maps, torch.zeros(n * D, dtype=torch.int64), at.reshape(-1, 2), STRIDE)
         log_depth, log_variance = self.network.depth.read(seen, T > 1, generator, T)

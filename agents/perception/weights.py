@@ -1,4 +1,6 @@
-"""Weights of the learned eyes: a folder with `eyes.safetensors` and `eyes.json` (its hash, classes, calibration)."""
+"""Weights of the learned eyes: a folder with `eyes.safetensors`, `eyes.json` (its hash, classes, calibration) and
+`familiar.safetensors` (what features look like on validation scenes).
+"""
 
 from __future__ import annotations
 
@@ -11,13 +13,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...matching.pose import Array
 
 TENSORS = "eyes.safetensors"
 MANIFEST = "eyes.json"
-FORMAT, VERSION = "covis-eyes", 4
-SAME_TENSORS = (3, 4)
+FAMILIAR = "familiar.safetensors"
+FORMAT, VERSION = "covis-eyes", 5
+SAME_TENSORS = (3, 4, 5)
 """Versions that differ in their calibration alone."""
 SHIPPED = Path(__file__).parent / "weights"
 """The folder of the weights that come with the package."""
@@ -36,11 +40,43 @@ QUANTITIES = {
     "width": 30.0,
     "height": 30.0,
 }
-"""Of what the corrections are functions, each with a usual value, see `calibration_features`."""
-TERMS = (len(QUANTITIES) + 1) * (len(QUANTITIES) + 2) // 2
+"""Of what the corrections are quadratic functions, each with a usual value, see `calibration_features`."""
+ADDED = {"class epistemic": 1e-4, "depth spread": 0.001, "box overlap": 0.8, "strangeness": 1.0}
+"""Of what they are linear functions besides; the last column of the features is of the strangeness."""
+TERMS = (len(QUANTITIES) + 1) * (len(QUANTITIES) + 2) // 2 + len(ADDED)
 FARTHEST = 3.0
 """Quantities are held within a factor e^3 of the usual: a square is no guide beyond what calibration has seen."""
 CORRECTIONS = ("depth", "along", "horizontal", "vertical")
+
+
+@dataclass(frozen=True, eq=False)
+class Familiar:
+    """What the backbone's features at objects look like on validation scenes.
+
+    Attributes:
+        mean: (d,).
+        whitening: (d, d), which turns deviations from the mean into uncorrelated ones of unit variance.
+    """
+
+    mean: NDArray[np.float32]
+    whitening: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, features: Array, share: Array, shrinkage: float = 0.05) -> Familiar:
+        """Of features (k, d), each counting by its `share` (k,).
+
+        `shrinkage` of the mean variance is added to every variance: directions that validation scenes hardly know do
+        not decide alone.
+        """
+        mean = share @ features / share.sum()
+        away = features - mean
+        covariance = (away * share[:, None]).T @ away / share.sum()
+        values, vectors = np.linalg.eigh(covariance + shrinkage * covariance.trace() / len(mean) * np.eye(len(mean)))
+        return cls(mean.astype(np.float32), (vectors / np.sqrt(values)).astype(np.float32))
+
+    def strangeness(self, features: Array) -> Array:
+        """Squared Mahalanobis distances (n,) of features (n, d) over d: about 1 on validation scenes."""
+        return (((features - self.mean) @ self.whitening) ** 2).mean(axis=1)
 
 
 @dataclass(frozen=True)
@@ -52,6 +88,7 @@ class Calibration:
         along, horizontal, vertical: the same for the factors on the variance along the viewing ray, beyond the square
             of that on the depth, and on the variances of the projected centre along the image's two axes.
         class_temperature: logits are divided by it.
+        familiar: against what strangeness is measured; None = it is not.
     """
 
     depth: tuple[float, ...] = (0.0,) * TERMS
@@ -59,6 +96,7 @@ class Calibration:
     horizontal: tuple[float, ...] = (0.0,) * TERMS
     vertical: tuple[float, ...] = (0.0,) * TERMS
     class_temperature: float = 1.0
+    familiar: Familiar | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.class_temperature) and self.class_temperature > 0):
@@ -82,8 +120,13 @@ def calibration_features(
     centre_variance: Array,
     confidence: Array,
     size: Array,
+    class_epistemic: Array,
+    depth_spread: Array,
+    box_overlap: Array,
+    strangeness: Array,
 ) -> Array:
-    """What is known of how sure n objects are (n, TERMS): 1, seven logarithms, and all products of two of them.
+    """What is known of how sure n objects are (n, TERMS): 1, the logarithms of QUANTITIES, all products of two of them,
+    and the logarithms of what is ADDED.
 
     Args:
         depth: (n,) m, uncalibrated like all the others.
@@ -91,14 +134,28 @@ def calibration_features(
         centre_variance: (n,) of the projected centre per axis, in squares of the box's size along it.
         confidence: (n,) that this is an object.
         size: (n, 2) px, width and height of the box.
+        class_epistemic: (n,) the part of v that is variance between samples.
+        depth_spread: (n,) variance of the log depth between the pixels of the mask.
+        box_overlap: (n,) IoU of the box with that of the mask.
+        strangeness: (n,) see `Familiar`; 1 where it is not measured.
     """
-    share = np.maximum(depth_epistemic / depth_variance, 0.02)
-    share = np.where(depth_epistemic == 0, QUANTITIES["epistemic"], share)  # a single sample: unknown
+    single = depth_epistemic == 0  # a single sample: what differs between samples is unknown
+    share = np.where(single, QUANTITIES["epistemic"], np.maximum(depth_epistemic / depth_variance, 0.02))
     raw = (depth_variance / depth**2, share, centre_variance, np.maximum(confidence, 0.05), depth, *size.T)
-    logs = [np.log(np.maximum(x, 1e-8) / usual) for x, usual in zip(raw, QUANTITIES.values(), strict=True)]
-    x = np.clip(logs, -FARTHEST, FARTHEST)
+    x = [_log(values, usual) for values, usual in zip(raw, QUANTITIES.values(), strict=True)]
     products = [x[i] * x[j] for i in range(len(x)) for j in range(i, len(x))]
-    return np.stack([np.ones(len(depth)), *x, *products], axis=1)
+    between = np.where(single, ADDED["class epistemic"], class_epistemic)
+    more = zip((between, depth_spread, box_overlap, strangeness), ADDED.values(), strict=True)
+    return np.stack([np.ones(len(depth)), *x, *products, *(_log(values, usual) for values, usual in more)], axis=1)
+
+
+def with_strangeness(features: Array, strangeness: Array) -> Array:
+    """Features (n, TERMS) as they are for objects of that strangeness (n,)."""
+    return np.concatenate([features[:, :-1], _log(strangeness, ADDED["strangeness"])[:, None]], axis=1)
+
+
+def _log(values: Array, usual: float) -> Array:
+    return np.clip(np.log(np.maximum(values, 1e-8) / usual), -FARTHEST, FARTHEST)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +180,8 @@ class Weights:
 
 
 def save(weights: Weights, folder: Path) -> None:
-    """Write both files; the manifest last, so that it never vouches for a half-written file."""
+    """Write all files; the manifest last, so that it never vouches for a half-written file."""
+    from safetensors.numpy import save as arrays_to_bytes
     from safetensors.torch import save as to_bytes
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -133,9 +191,14 @@ def save(weights: Weights, folder: Path) -> None:
         "version": VERSION,
         "sha256": hashlib.sha256(content).hexdigest(),
         "network": dict(weights.network),
-        "calibration": vars(weights.calibration),
+        "calibration": {name: value for name, value in vars(weights.calibration).items() if name != "familiar"},
         "notes": dict(weights.notes),
     }
+    familiar = weights.calibration.familiar
+    if familiar is not None:
+        arrays = arrays_to_bytes(vars(familiar))
+        manifest["familiar_sha256"] = hashlib.sha256(arrays).hexdigest()
+        _replace(folder / FAMILIAR, arrays)
     _replace(folder / TENSORS, content)
     _replace(folder / MANIFEST, (json.dumps(manifest, indent=1) + "\n").encode())
 
@@ -143,11 +206,12 @@ def save(weights: Weights, folder: Path) -> None:
 def load(folder: Path | None = None, *, calibrated: bool = True) -> Weights:
     """The weights in a folder; None = those that come with the package.
 
-    Without `calibrated` their calibration is not read, and may be one of an older version.
+    Without `calibrated` only the class temperature of their calibration is read, which may be of an older version.
 
     Raises:
         WeightsError: a file is missing, the tensors are not those that the manifest vouches for, another format.
     """
+    from safetensors.numpy import load as arrays_from_bytes
     from safetensors.torch import load as from_bytes
 
     folder = SHIPPED if folder is None else folder
@@ -155,12 +219,25 @@ def load(folder: Path | None = None, *, calibrated: bool = True) -> Weights:
         if not (folder / name).is_file():
             raise WeightsError(f"learned perception needs {folder / name}: train it with `covis train perception`")
     manifest = read_manifest(folder, (VERSION,) if calibrated else SAME_TENSORS)
-    content = (folder / TENSORS).read_bytes()
+    tensors = from_bytes(_verified(folder / TENSORS, manifest["sha256"]))
+    stated = manifest["calibration"]
+    if calibrated:
+        vouched = manifest.get("familiar_sha256")
+        familiar = Familiar(**arrays_from_bytes(_verified(folder / FAMILIAR, vouched))) if vouched else None
+        calibration = Calibration(**stated, familiar=familiar)
+    else:
+        calibration = Calibration(class_temperature=stated.get("class_temperature", 1.0))
+    return Weights(tensors, manifest["network"], calibration, manifest.get("notes", {}))
+
+
+def _verified(path: Path, expected: str) -> bytes:
+    if not path.is_file():
+        raise WeightsError(f"learned perception needs {path}, for which the manifest vouches")
+    content = path.read_bytes()
     found = hashlib.sha256(content).hexdigest()
-    if found != manifest["sha256"]:
-        raise WeightsError(f"{folder / TENSORS} has been altered: SHA-256 {found}, expected {manifest['sha256']}")
-    calibration = Calibration(**manifest["calibration"]) if calibrated else Calibration()
-    return Weights(from_bytes(content), manifest["network"], calibration, manifest.get("notes", {}))
+    if found != expected:
+        raise WeightsError(f"{path} has been altered: SHA-256 {found}, expected {expected}")
+    return content
 
 
 def read_manifest(folder: Path, versions: tuple[int, ...] = (VERSION,)) -> dict[str, Any]:

@@ -65,6 +65,12 @@ def tiny_weights(seed: int = 0, params: NetworkParams = TINY) -> stored.Weights:
     return stored.Weights(network.state_dict(), params.to_dict())
 
 
+def familiar_weights() -> stored.Weights:
+    d = 3 * TINY.neck
+    familiar = stored.Familiar(np.zeros(d, np.float32), np.eye(d, dtype=np.float32))
+    return replace(tiny_weights(), calibration=stored.Calibration(familiar=familiar))
+
+
 def observation(seed: int = 0, width: int = 128, height: int = 96) -> dict:
     rng = np.random.default_rng(seed)
     image = np.repeat(np.repeat(rng.integers(0, 255, (height // 8, width // 8, 3)), 8, 0), 8, 1).astype(np.uint8)
@@ -317,6 +323,49 @@ def test_calibration_scales_depths_and_the_variance_along_each_axis():
     np.testing.assert_allclose(after, 1.21 * np.sqrt(np.outer([4, 9, 0.25], [4, 9, 0.25])) * before, atol=1e-9)
 
 
+def test_strange_objects_are_less_sure():
+    def strange(weight: float) -> stored.Calibration:
+        d = 3 * TINY.neck
+        familiar = stored.Familiar(np.zeros(d, np.float32), 10 * np.eye(d, dtype=np.float32))
+        return stored.Calibration(along=(*[0.0] * (stored.TERMS - 1), weight), familiar=familiar)
+
+    params = LearnedPerceptionParams(samples=2, score=0.1, min_pixels=1)
+    seen = [
+        LearnedPerception(CLASSES, replace(tiny_weights(), calibration=calibration), params).see(
+            observation(), np.random.default_rng(0)
+        )
+        for calibration in (stored.Calibration(), strange(1.0))
+    ]
+    expected = (10 * seen[0].backbone) ** 2
+    np.testing.assert_allclose(
+        seen[1].features[:, -1], np.clip(np.log(expected.mean(axis=1)), -stored.FARTHEST, stored.FARTHEST), rtol=1e-5
+    )
+    assert (seen[0].features[:, -1] == 0).all()
+    ratio = seen[1].depth_variance / seen[0].depth_variance
+    np.testing.assert_allclose(np.log(ratio), seen[1].features[:, -1], rtol=1e-5)
+
+
+def test_what_differs_between_samples_is_unknown_of_a_single_one():
+    def features(epistemic: float, class_epistemic: float) -> np.ndarray:
+        one = np.ones(1)
+        return stored.calibration_features(
+            depth=8 * one,
+            depth_variance=0.2 * one,
+            depth_epistemic=epistemic * one,
+            centre_variance=0.02 * one,
+            confidence=one,
+            size=np.full((1, 2), 30.0),
+            class_epistemic=class_epistemic * one,
+            depth_spread=0.001 * one,
+            box_overlap=0.8 * one,
+            strangeness=one,
+        )
+
+    usual = stored.QUANTITIES["epistemic"] * 0.2, stored.ADDED["class epistemic"]
+    np.testing.assert_allclose(features(0, 0), features(*usual), atol=1e-12)
+    assert (features(0.1, 0.01) != features(*usual)).any()
+
+
 def test_covariances_lie_along_the_ray_and_the_axes_of_the_image():
     rng = np.random.default_rng(0)
     positions = np.concatenate([rng.normal(size=(5, 3)) + [0, 0, 4], [[0, 0, 2]]])
@@ -381,24 +430,25 @@ def test_the_height_moves_the_depth_as_far_as_it_can_be_trusted():
 
 
 def test_weights_come_back_as_they_were_saved(tmp_path):
-    saved = replace(
-        tiny_weights(),
-        calibration=stored.Calibration(*(tuple(k * i for i in range(stored.TERMS)) for k in (0.1, 0.2, 0.3, 0.4)), 1.5),
-        notes={"minutes": 1},
-    )
+    terms = (tuple(k * i for i in range(stored.TERMS)) for k in (0.1, 0.2, 0.3, 0.4))
+    familiar = stored.Familiar(np.arange(3, dtype=np.float32), np.eye(3, dtype=np.float32))
+    saved = replace(tiny_weights(), calibration=stored.Calibration(*terms, 1.5, familiar), notes={"minutes": 1})
     stored.save(saved, tmp_path)
     loaded = stored.load(tmp_path)
     assert loaded.classes == CLASSES
     assert loaded.calibration == saved.calibration
+    np.testing.assert_array_equal(loaded.calibration.familiar.mean, familiar.mean)
+    np.testing.assert_array_equal(loaded.calibration.familiar.whitening, familiar.whitening)
     assert loaded.notes == {"minutes": 1}
     for name, tensor in saved.tensors.items():
         torch.testing.assert_close(loaded.tensors[name], tensor, rtol=0, atol=0)
     assert NetworkParams.from_dict(dict(loaded.network)) == TINY
 
 
-def test_altered_weights_are_refused(tmp_path):
-    stored.save(tiny_weights(), tmp_path)
-    path = tmp_path / stored.TENSORS
+@pytest.mark.parametrize("name", [stored.TENSORS, stored.FAMILIAR])
+def test_altered_weights_are_refused(tmp_path, name):
+    stored.save(familiar_weights(), tmp_path)
+    path = tmp_path / name
     content = bytearray(path.read_bytes())
     content[-1] ^= 1
     path.write_bytes(bytes(content))
@@ -406,9 +456,9 @@ def test_altered_weights_are_refused(tmp_path):
         stored.load(tmp_path)
 
 
-@pytest.mark.parametrize("name", [stored.TENSORS, stored.MANIFEST])
+@pytest.mark.parametrize("name", [stored.TENSORS, stored.MANIFEST, stored.FAMILIAR])
 def test_missing_weights_are_named(tmp_path, name):
-    stored.save(tiny_weights(), tmp_path)
+    stored.save(familiar_weights(), tmp_path)
     (tmp_path / name).unlink()
     with pytest.raises(stored.WeightsError, match=name):
         stored.load(tmp_path)
@@ -433,6 +483,9 @@ def test_weights_with_an_older_calibration_say_how_to_renew_it(tmp_path):
     with pytest.raises(stored.WeightsError, match="--calibrate"):
         stored.load(tmp_path)
     assert stored.load(tmp_path, calibrated=False).calibration == stored.Calibration()
+    old = {"version": 4, "calibration": {"class_temperature": 0.9, "along": [1.0]}}
+    path.write_text(json.dumps(json.loads(path.read_text()) | old))
+    assert stored.load(tmp_path, calibrated=False).calibration == stored.Calibration(class_temperature=0.9)
 
 
 def test_unknown_classes_are_named():

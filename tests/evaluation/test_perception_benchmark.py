@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from covis.agents.perception.weights import TERMS, Calibration, calibration_features
+from covis.agents.perception.weights import TERMS, Calibration, Familiar, calibration_features, with_strangeness
 from covis.evaluation.perception_benchmark import (
     consistency,
     ence,
@@ -12,6 +12,7 @@ from covis.evaluation.perception_benchmark import (
     perception_benchmark,
     row,
     shift,
+    shift_columns,
     spearman,
 )
 from covis.evaluation.perception_images import PerceptionTarget
@@ -91,6 +92,8 @@ def gaussian_tally(
         error=[-offset[:, 0]],
         u=[u],
         v=[np.full(n, 0.1)],
+        u_epistemic=[0.2 * u],
+        v_epistemic=[np.full(n, 0.01)],
         offset=[offset],
         variances=[variances],
         attributes=[p],
@@ -114,6 +117,10 @@ def known(u: np.ndarray, distance: np.ndarray, confidence: np.ndarray, size: np.
         centre_variance=centre_variance,
         confidence=confidence,
         size=size,
+        class_epistemic=np.full(len(u), 1e-4),
+        depth_spread=np.full(len(u), 0.001),
+        box_overlap=np.full(len(u), 0.8),
+        strangeness=np.ones(len(u)),
     )
 
 
@@ -166,6 +173,20 @@ def test_calibration_learns_that_doubtful_objects_err_more_than_reported():
     assert ence(corrected, squared) < 0.5 * ence(biased.u[0], squared)
 
 
+def test_calibration_learns_that_strange_objects_err_more_than_reported():
+    rng = np.random.default_rng(4)
+    backbone = rng.normal(size=(4000, 6)) * np.exp(rng.normal(0, 0.5, (4000, 1)))
+    familiar = Familiar.of(backbone, np.ones(4000))
+    strange = familiar.strangeness(backbone)
+    assert strange.mean() == pytest.approx(1, rel=0.1)
+    plain = gaussian_tally(np.clip(strange, 0.05, 20), 4000)
+    plain.backbone = [backbone]
+    found = calibrate([plain])
+    features = with_strangeness(plain.features[0], found.familiar.strangeness(backbone))
+    assert np.corrcoef(np.log(found.factors(features)[:, 1]), np.log(strange))[0, 1] > 0.95
+    assert calibrate([gaussian_tally(1)]).familiar is None
+
+
 def test_calibration_uses_what_does_not_count_in_the_figures():
     small = gaussian_tally(9)
     small.counts = [np.zeros(4000, bool)]
@@ -210,7 +231,13 @@ def test_shift_compares_like_with_like():
     far = strange.of("true_distance") > 10
     strange.u = [np.where(far, 50.0, 2 * strange.of("u"))]
     strange.true_distance = [np.where(far, 500.0, strange.of("true_distance"))]  # no such objects are known
+    strange.u_epistemic = [strange.u_epistemic[0] * 3]
+    strange.v_epistemic = [strange.v_epistemic[0] * 4]
     found = shift(known, strange)
+    assert found["u_epistemic_ratio_matched"] == pytest.approx(3, rel=0.15)
+    assert found["u_aleatoric_ratio_matched"] == pytest.approx((2 - 3 * 0.2) / 0.8, rel=0.15)
+    assert found["v_epistemic_ratio_matched"] == pytest.approx(4)
+    assert found["v_aleatoric_ratio_matched"] == pytest.approx((0.1 - 0.04) / 0.09)
     assert found["u_ratio_matched"] == pytest.approx(2, rel=0.15)
     assert found["v_ratio_matched"] == pytest.approx(1)
     assert found["squared_error_ratio_matched"] == pytest.approx(1, rel=0.15)
@@ -252,8 +279,10 @@ def test_counting_one_image():
         pixels[:2],
         graph.positions[:, 2],
         np.ones(2),
-        np.zeros(2),
+        np.full(2, 0.25),
+        np.array([0.01, 0.02]),
         np.zeros((2, TERMS)),
+        None,
         {"all": 3.0},
     )
     out = Tally()
@@ -269,6 +298,8 @@ def test_counting_one_image():
     assert figures["precision"] == 1
     np.testing.assert_allclose(out.of("offset")[0], [-1, 0, 0], atol=1e-12)
     assert out.of("variances")[0, 0] == pytest.approx(1.0)
+    np.testing.assert_allclose(out.of("u_epistemic"), [0.25, 0.025])
+    np.testing.assert_allclose(out.of("v_epistemic"), [0.01, 0.02])
 
 
 def test_detections_that_meet_an_object_by_their_box_alone_count_for_calibration_only():
@@ -289,7 +320,9 @@ def test_detections_that_meet_an_object_by_their_box_alone_count_for_calibration
         np.array([5.0]),
         np.ones(1),
         np.zeros(1),
+        np.zeros(1),
         np.zeros((1, TERMS)),
+        np.ones((1, 5)),
         {"all": 3.0},
     )
     out = Tally()
@@ -297,6 +330,7 @@ def test_detections_that_meet_an_object_by_their_box_alone_count_for_calibration
     assert (out.detections, out.true_detections) == (1, 0)
     assert len(out.of("u")) == 0
     assert out.of("error", every=True) == pytest.approx([1.0])
+    assert out.of("backbone", every=True).shape == (1, 5)
 
 
 def test_untrained_eyes_give_rows_for_a_known_and_a_held_out_target():
@@ -319,7 +353,9 @@ def test_untrained_eyes_give_rows_for_a_known_and_a_held_out_target():
         assert r["images"] == 3
         assert r["objects"] > 0
         assert {"ap50", "class_accuracy", "depth_abs_rel", "depth_spearman", "depth_only_spearman", "ence"} <= set(r)
-    assert "u_ratio_matched" in rows[1]
+    assert {key for key, _ in shift_columns()} <= set(rows[1])
+    assert rows[1]["known_ap50"] == rows[0]["ap50"]
+    assert "known_ap50" not in rows[0]
 
 
 def test_weights_are_calibrated_anew_without_training(tmp_path, monkeypatch):
@@ -348,9 +384,11 @@ def test_weights_are_calibrated_anew_without_training(tmp_path, monkeypatch):
         app, ["train", "perception", "--out", str(tmp_path), "--calibrate", "--calibration-images", "5"]
     )
     assert result.exit_code == 0, result.output
-    assert asked == [(Calibration(), 5)]
+    assert asked == [(Calibration(class_temperature=2.0), 5)]
     renewed = stored.load(tmp_path)
     assert renewed.calibration.along[0] == pytest.approx(np.log(4), abs=1)
+    # What was seen had been divided by 2 already, and was right.
+    assert renewed.calibration.class_temperature == pytest.approx(2.0, rel=0.1)
     assert renewed.notes == {"minutes": 3, "calibration_images_per_scene": 5}
     assert (tmp_path / stored.TENSORS).read_bytes() == content
     result = CliRunner().invoke(app, ["train", "perception", "--out", str(tmp_path / "none"), "--calibrate"])
