@@ -13,6 +13,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
+from ..matching.checks import check_count, check_interval
 from ..matching.graph import ObjectGraph
 
 Payload = TypeVar("Payload")
@@ -31,6 +32,9 @@ class ChannelOptions:
         latency_s: from sending to arrival. jitter_s: 1 sigma added to it, never making it negative.
         loss: probability that a message never arrives.
         bandwidth_bytes_s: shared by all senders; messages queue for it. None = unlimited.
+
+    Raises:
+        ValueError: a value out of its range.
     """
 
     latency_s: float = 0.0
@@ -39,12 +43,11 @@ class ChannelOptions:
     bandwidth_bytes_s: float | None = None
 
     def __post_init__(self) -> None:
-        if not (self.latency_s >= 0 and self.jitter_s >= 0):
-            raise ValueError(f"latency_s and jitter_s must be non-negative, got {self.latency_s} and {self.jitter_s}")
-        if not 0 <= self.loss <= 1:
-            raise ValueError(f"loss must lie in [0, 1], got {self.loss}")
-        if self.bandwidth_bytes_s is not None and not self.bandwidth_bytes_s > 0:
-            raise ValueError(f"bandwidth_bytes_s must be positive, got {self.bandwidth_bytes_s}")
+        check_interval("latency_s", self.latency_s, "[0, inf)")
+        check_interval("jitter_s", self.jitter_s, "[0, inf)")
+        check_interval("loss", self.loss, "[0, 1]")
+        if self.bandwidth_bytes_s is not None:
+            check_interval("bandwidth_bytes_s", self.bandwidth_bytes_s, "(0, inf]")
 
 
 @dataclass(frozen=True)
@@ -82,9 +85,13 @@ class Channel(Generic[Payload]):
         self._free_at_s = -np.inf
 
     def send(self, sender: str, receiver: str, payload: Payload, *, time: float, size_bytes: int) -> None:
-        """Put a message on the air at `time` s. Lost messages use bandwidth all the same."""
-        if size_bytes < 0:
-            raise ValueError(f"size_bytes must be non-negative, got {size_bytes}")
+        """Put a message on the air at `time` s. Lost messages use bandwidth all the same.
+
+        Raises:
+            ValueError: a time that is not finite, or a negative size.
+        """
+        check_interval("time", time, "(-inf, inf)")
+        check_count("size_bytes", size_bytes, 0)
         o, t = self.options, self.traffic
         lost = bool(self._rng.random() < o.loss)
         jitter = float(self._rng.normal()) * o.jitter_s

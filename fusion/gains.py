@@ -51,9 +51,10 @@ def fuse(
         Every group with a position in the frame; groups seen only by robots of unknown pose are left out.
 
     Raises:
+        TypeError: something else than graphs, relative poses and matchings.
         ValueError: a robot or gain that does not exist, or relative poses surer than `frame_covariance` allows.
     """
-    _check(graphs, frame, gain)
+    _check(graphs, poses, frame, gain)
     groups = matchings if isinstance(matchings, Groups) else group_detections([len(g) for g in graphs], matchings)
     if gain == "joint":
         # Poses between partners often rest on the same errors, one world pose per robot: only the frame's own count.
@@ -97,7 +98,13 @@ def fuse_own(
     return own_objects(graphs, fused, gain=gain)
 
 
-def _check(graphs: Sequence[ObjectGraph], frame: int, gain: str) -> None:
+def _check(graphs: Sequence[ObjectGraph], poses: Mapping[tuple[int, int], RelativePose], frame: int, gain: str) -> None:
+    for robot, graph in enumerate(graphs):
+        if not isinstance(graph, ObjectGraph):
+            raise TypeError(f"graphs[{robot}] must be an ObjectGraph, got {type(graph).__name__}")
+    for pair, pose in poses.items():
+        if not isinstance(pose, RelativePose):
+            raise TypeError(f"poses[{pair}] must be a RelativePose, got {type(pose).__name__}")
     if not 0 <= frame < len(graphs):
         raise ValueError(f"frame must be a robot in 0..{len(graphs) - 1}, got {frame}")
     if gain not in GAINS:

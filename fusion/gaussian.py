@@ -8,10 +8,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import minimize, minimize_scalar
 
-Array = NDArray[np.float64]
+from ..matching.checks import numbers
+from ..matching.pose import Array
 
 RELATIVE_FLOOR = 1e-12
 """Smallest eigenvalue of a covariance over its trace before it is inverted."""
@@ -62,6 +63,9 @@ def fuse_isotropic(positions: ArrayLike, variances: ArrayLike) -> Gaussian:
     Args:
         positions: (N, d) m, every robot's measurement, already in one frame.
         variances: (N,) m^2.
+
+    Raises:
+        ValueError: shapes that do not fit, or a negative or NaN variance.
     """
     p = np.asarray(positions, dtype=np.float64)
     gains = fusion_gains(variances)
@@ -74,7 +78,11 @@ def fuse_isotropic(positions: ArrayLike, variances: ArrayLike) -> Gaussian:
 
 
 def information_matrix(covariance: ArrayLike) -> Array:
-    """Inverse (d, d) of a covariance (d, d); zero along axes of infinite variance, huge where it is zero."""
+    """Inverse (d, d) of a covariance (d, d); zero along axes of infinite variance, huge where it is zero.
+
+    Raises:
+        ValueError: not square, a NaN, or a negative variance.
+    """
     C = np.asarray(covariance, dtype=np.float64)
     if C.ndim != 2 or C.shape[0] != C.shape[1]:
         raise ValueError(f"covariance must be square, got shape {C.shape}")
@@ -97,6 +105,9 @@ def fuse_gaussians(means: ArrayLike, covariances: ArrayLike) -> Gaussian:
     Args:
         means: (N, d), one frame.
         covariances: (N, d, d).
+
+    Raises:
+        ValueError: shapes that do not fit, a mean that is not finite, or a negative or NaN variance.
     """
     x, C = _check_estimates(means, covariances)
     return _from_information([information_matrix(c) for c in C], x, np.ones(len(x)))
@@ -162,6 +173,7 @@ def _intersection_weights(information: list[Array], criterion: str) -> Array:
 
 
 def _from_information(information: list[Array], means: Array, weights: Array) -> Gaussian:
+    """Fusion of means (N, d) by weighted information; where none has any, their plain mean and infinite variance."""
     stacked = np.stack(information) * weights[:, None, None]
     total = stacked.sum(axis=0)
     vector = np.einsum("nij,nj->i", stacked, means)
@@ -179,7 +191,7 @@ def _from_information(information: list[Array], means: Array, weights: Array) ->
 
 
 def _check_variances(variances: ArrayLike) -> Array:
-    u = np.asarray(variances, dtype=np.float64)
+    u = numbers(variances, "variances")
     if u.ndim < 1 or len(u) == 0:
         raise ValueError(f"variances must have a leading axis of at least one robot, got shape {u.shape}")
     if not (u >= 0).all():
@@ -188,8 +200,7 @@ def _check_variances(variances: ArrayLike) -> Array:
 
 
 def _check_estimates(means: ArrayLike, covariances: ArrayLike) -> tuple[Array, Array]:
-    x = np.asarray(means, dtype=np.float64)
-    C = np.asarray(covariances, dtype=np.float64)
+    x, C = numbers(means, "means"), numbers(covariances, "covariances")
     if x.ndim != 2 or len(x) == 0:
         raise ValueError(f"means must have shape (N, d) with N >= 1, got {x.shape}")
     if C.shape != (*x.shape, x.shape[1]):

@@ -56,6 +56,7 @@ def group_detections(sizes: Sequence[int], matchings: Mapping[tuple[int, int], M
         matchings: (source robot, target robot) -> Matching; each unordered pair of robots at most once.
 
     Raises:
+        TypeError: something else than a Matching.
         ValueError: a robot or a detection that does not exist, a robot matched with itself, a pair given both ways.
     """
     N = len(sizes)
@@ -80,6 +81,8 @@ def _edges(
     N = len(counts)
     edges, scores = [np.zeros((0, 2), dtype=np.int64)], [np.zeros(0)]
     for (i, j), matching in matchings.items():
+        if not isinstance(matching, Matching):
+            raise TypeError(f"matchings[{i, j}] must be a Matching, got {type(matching).__name__}")
         if not (0 <= i < N and 0 <= j < N) or i == j:
             raise ValueError(f"matchings name robots ({i}, {j}), but there are {N} robots")
         if (j, i) in matchings:
@@ -98,6 +101,7 @@ def _edges(
 
 @njit(cache=True)
 def _root(parent: NDArray[np.int64], i: int) -> int:
+    """Root of i in a forest of parents, with paths halved on the way."""
     while parent[i] != i:
         parent[i] = parent[parent[i]]
         i = parent[i]

@@ -70,6 +70,7 @@ def fuse_groups(rows: NDArray[np.int64], positions: Array, covariances: Array) -
 
 @njit(cache=True)
 def _invert_information(A: Array, out: Array) -> None:
+    """Inverse of a symmetric information matrix (3, 3), scaled so that its size does not matter."""
     scale = 3.0 / (A[0, 0] + A[1, 1] + A[2, 2])
     scaled = A * scale
     inverse = np.linalg.inv(scaled)

@@ -6,12 +6,13 @@ seen again puts all the others right. The robot stays at the origin; what moves 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..matching.checks import check_count, check_interval
 from ..matching.graph import ObjectGraph
 from ..matching.pose import Array, invert, transform
 from .posefilter import heading, levelling
@@ -42,6 +43,9 @@ class MapOptions:
             matching of maps worse.
         floor_m: 1 sigma that is left however often a landmark was seen.
         max_std_m: one that is less certain than this is not shown to the matcher.
+
+    Raises:
+        ValueError: a value out of its range.
     """
 
     odometry_std_m: float = 0.006
@@ -60,6 +64,14 @@ class MapOptions:
     memory: int = 40
     floor_m: float = 0.02
     max_std_m: float = 0.3
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            if field.name in ("trials", "patience", "memory"):
+                check_count(field.name, getattr(self, field.name), 0)
+            elif field.name != "doubt":
+                check_interval(field.name, getattr(self, field.name), "[0, inf)")
+        check_interval("doubt", self.doubt, "(-inf, inf)")
 
 
 class _Fit(NamedTuple):
@@ -208,6 +220,7 @@ class LocalMap:
         return np.asarray(number[landmark])
 
     def _add(self, graph: ObjectGraph) -> None:
+        """Make landmarks of detections."""
         k, n = len(self.positions), len(graph)
         C = np.zeros((k + n, 3, k + n, 3))
         C[:k, :, :k] = self.covariance.reshape(k, 3, k, 3)
@@ -220,6 +233,7 @@ class LocalMap:
         self._looks = graph if self._looks is None else _joined(self._looks, graph)
 
     def _take(self, index: NDArray[np.int64]) -> None:
+        """Keep the landmarks at `index`, in that order."""
         rows = (3 * index[:, None] + np.arange(3)).ravel()
         self.positions, self.covariance = self.positions[index], self.covariance[np.ix_(rows, rows)]
         self._sightings, self._age = self._sightings[index], self._age[index]

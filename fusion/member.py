@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..matching.checks import check_interval
 from ..matching.graph import Matching, ObjectGraph
 from ..matching.pose import (
     Array,
@@ -25,7 +26,7 @@ from ..matching.pose import (
 )
 from .channel import BYTES_PER_NUMBER, message_size
 from .gains import fuse
-from .objects import FusedObjects, Gain, OwnObjects, agreement, own_objects
+from .objects import GAINS, FusedObjects, Gain, OwnObjects, agreement, own_objects
 from .registration import log_se3
 from .tracking import Batch, Tracker, TrackerOptions
 
@@ -83,6 +84,10 @@ class OdometryNoise:
     heading_rad: float = 0.002
     position_m: float = 0.001
 
+    def __post_init__(self) -> None:
+        for name in ("position_per_m", "heading_rad", "position_m"):
+            check_interval(name, getattr(self, name), "[0, inf)")
+
     def covariance(self, motion: Array, up: Array) -> Array:
         """(6, 6), right perturbation."""
         out = np.zeros((6, 6))
@@ -107,6 +112,9 @@ class MemberOptions:
         repeated: share of a measurement's variance that the next measurement of the object repeats (an object's centre
             lies as far from its surface as before, a network misjudges it as before), which no averaging takes away.
         odometry: errors of the robot's own motion.
+
+    Raises:
+        ValueError: a value out of its range.
     """
 
     gain: Gain = "covariance"
@@ -117,6 +125,14 @@ class MemberOptions:
     tracker: TrackerOptions | None = field(default_factory=TrackerOptions)
     repeated: float = 0.0
     odometry: OdometryNoise = OdometryNoise()
+
+    def __post_init__(self) -> None:
+        if self.gain not in GAINS:
+            raise ValueError(f"gain must be one of {', '.join(GAINS)}, got {self.gain!r}")
+        if self.gate is not None:
+            check_interval("gate", self.gate, "(0, 1)")
+        check_interval("least_agreement", self.least_agreement, "[0, 1]")
+        check_interval("repeated", self.repeated, "[0, inf)")
 
 
 UNPROTECTED = MemberOptions(gate=None, least_agreement=0.0, own_time=False)
@@ -268,6 +284,7 @@ class Member:
         return fused.members[:, both][fused.used[:, both].all(axis=1)]
 
     def _steadied(self, time: float, graph: ObjectGraph, T_odometry_sensor: Array) -> ObjectGraph:
+        """The detections at the positions of their tracks, from this robot's measurements alone."""
         if self.alone is None:
             return graph
         R = T_odometry_sensor[:3, :3]
@@ -291,6 +308,7 @@ class Member:
         self.agreement[seen] += AGREEMENT_RATE * (share[seen] - self.agreement[seen])
 
     def _fused(self, moment: _Moment) -> FusedObjects:
+        """All objects of a moment from the partners that are believed, made once."""
         if moment.fused is None:
             trusted = self.agreement >= self.options.least_agreement
             moment.fused = self._fuse(moment, {j: report for j, report in moment.reports.items() if trusted[j]})
@@ -319,6 +337,7 @@ class Member:
         )
 
     def _own(self, moment: _Moment, fused: FusedObjects) -> OwnObjects:
+        """The own detections of a moment."""
         nothing = moment.own.graph.take(np.zeros(0, dtype=np.int64))
         graphs = [nothing] * self.n_robots
         graphs[self.robot] = moment.own.graph
@@ -348,11 +367,13 @@ class Member:
         return np.array([names[j][row[j]] for j, row in zip(first.tolist(), members, strict=True)], dtype=np.int64)
 
     def _alone(self) -> Localized:
+        """The last moment's detections without tracks."""
         now = self._moments[-1]
         own = self._own(now, self._fused(now))
         return Localized(own, np.full(len(own.positions), -1, dtype=np.int64))
 
     def _together(self, tracker: Tracker) -> Localized:
+        """The last moment's detections at the positions of their tracks."""
         now = self._moments[-1]
         own = self._own(now, self._fused(now))
         labels = tracker.labels(now.own.time)[: len(now.own.graph)]

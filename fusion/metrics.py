@@ -6,13 +6,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2
 
+from ..matching.checks import check_count, check_interval, numbers
+from ..matching.pose import Array
 from .gaussian import information_matrix
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,12 @@ class Displacement:
 
 
 def displacement_errors(estimates: ArrayLike, truths: ArrayLike) -> Array:
-    """Euclidean errors (n,) m of estimates (n, 3) against truths (n, 3), in one frame."""
-    x, t = np.asarray(estimates, dtype=np.float64), np.asarray(truths, dtype=np.float64)
+    """Euclidean errors (n,) m of estimates (n, d) against truths (n, d), in one frame.
+
+    Raises:
+        ValueError: shapes that do not fit.
+    """
+    x, t = numbers(estimates, "estimates"), numbers(truths, "truths")
     if x.shape != t.shape or x.ndim != 2:
         raise ValueError(f"estimates and truths must both be (n, d), got {x.shape} and {t.shape}")
     return np.asarray(np.linalg.norm(x - t, axis=1))
@@ -64,10 +68,16 @@ def gospa(estimates: ArrayLike, truths: ArrayLike, *, cutoff: float = 2.0, p: fl
     Args:
         estimates: (n, d) m; truths: (m, d) m, one frame; either may be empty.
         cutoff: m, error beyond which an estimate does not belong to a truth.
+        p: exponent of the errors, at least 1.
+
+    Raises:
+        ValueError: cutoff or p out of range, or shapes that do not fit.
     """
-    if cutoff <= 0 or p < 1:
-        raise ValueError(f"cutoff must be positive and p at least 1, got {cutoff} and {p}")
-    x, t = np.asarray(estimates, dtype=np.float64), np.asarray(truths, dtype=np.float64)
+    check_interval("cutoff", cutoff, "(0, inf)")
+    check_interval("p", p, "[1, inf)")
+    x, t = numbers(estimates, "estimates"), numbers(truths, "truths")
+    if x.ndim != 2 or t.ndim != 2 or x.shape[1] != t.shape[1]:
+        raise ValueError(f"estimates must be (n, d) and truths (m, d), got {x.shape} and {t.shape}")
     n, m = len(x), len(t)
     localisation, assigned = 0.0, 0
     if n and m:
@@ -85,8 +95,11 @@ def nees(errors: ArrayLike, covariances: ArrayLike) -> Array:
 
     Args:
         errors: (n, d); covariances: (n, d, d).
+
+    Raises:
+        ValueError: shapes that do not fit.
     """
-    e, C = np.asarray(errors, dtype=np.float64), np.asarray(covariances, dtype=np.float64)
+    e, C = numbers(errors, "errors"), numbers(covariances, "covariances")
     if e.ndim != 2 or C.shape != (*e.shape, e.shape[1]):
         raise ValueError(f"errors must be (n, d) with covariances (n, d, d), got {e.shape} and {C.shape}")
     return np.array([float(x @ information_matrix(c) @ x) for x, c in zip(e, C, strict=True)])
@@ -99,7 +112,14 @@ def nees_per_dof(errors: ArrayLike, covariances: ArrayLike) -> float:
 
 
 def nees_interval(n: int, dof: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Where honest covariances put `nees_per_dof` over n independent estimates of `dof` degrees of freedom."""
+    """Where honest covariances put `nees_per_dof` over n independent estimates of `dof` degrees of freedom.
+
+    Raises:
+        ValueError: no estimates, no degree of freedom, or a confidence outside (0, 1).
+    """
+    check_count("n", n)
+    check_count("dof", dof)
+    check_interval("confidence", confidence, "(0, 1)")
     tail = (1 - confidence) / 2
     low, high = chi2.ppf([tail, 1 - tail], n * dof) / (n * dof)
     return float(low), float(high)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from ..matching.checks import check_interval
 from ..matching.graph import ObjectGraph
 from ..matching.pose import Array, RelativePose, skews
 from .gaussian import covariance_intersection
@@ -143,8 +144,7 @@ def _threshold(gate: float | None) -> float:
     """Squared Mahalanobis distance that a share `gate` of honest differences in three dimensions stays below."""
     if gate is None:
         return float("inf")
-    if not 0 < gate < 1:
-        raise ValueError(f"gate must lie in (0, 1), got {gate}")
+    check_interval("gate", gate, "(0, 1)")
     return float(chi2.ppf(gate, 3))
 
 

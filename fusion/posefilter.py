@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..matching.checks import check_count, check_interval
 from ..matching.pose import Array, RelativePose
 from .registration import rotation_between
 
@@ -36,6 +37,9 @@ class PoseFilterOptions:
         extent_m: side of the square in which the partner may be when nothing is known.
         independence: share of a frame's evidence that is new, not a copy of the last frame's.
         max_components: of more, the least likely are dropped.
+
+    Raises:
+        ValueError: a value out of its range.
     """
 
     walk_std_m: float = 0.2
@@ -51,26 +55,15 @@ class PoseFilterOptions:
     max_components: int = 6
 
     def __post_init__(self) -> None:
+        for name in ("walk_std_m", "walk_std_rad"):
+            check_interval(name, getattr(self, name), "[0, inf)")
+        for name in ("odometry_std_m", "odometry_std_per_m", "odometry_std_rad", "odometry_std_per_rad"):
+            check_interval(name, getattr(self, name), "[0, inf)")
         for name in ("lost", "overlooked"):
-            if not 0 < getattr(self, name) < 1:
-                raise ValueError(f"{name} must lie in (0, 1), got {getattr(self, name)}")
-        if not 0 < self.independence <= 1:
-            raise ValueError(f"independence must lie in (0, 1], got {self.independence}")
-        if self.max_components < 1:
-            raise ValueError(f"max_components must be at least 1, got {self.max_components}")
-
-
-@dataclass(frozen=True, eq=False)
-class Belief:
-    """A weighted alternative for the relative pose of a pair.
-
-    Attributes:
-        pose: target in source.
-        probability: of this alternative.
-    """
-
-    pose: RelativePose
-    probability: float
+            check_interval(name, getattr(self, name), "(0, 1)")
+        check_interval("extent_m", self.extent_m, "(0, inf)")
+        check_interval("independence", self.independence, "(0, 1]")
+        check_count("max_components", self.max_components)
 
 
 @dataclass(frozen=True, eq=False)
@@ -345,11 +338,3 @@ def _turned(angles: Array, vectors: Array) -> Array:
     v = np.broadcast_to(vectors, (len(angles), 3))
     c, s = np.cos(angles), np.sin(angles)
     return np.column_stack([c * v[:, 0] - s * v[:, 1], s * v[:, 0] + c * v[:, 1], v[:, 2]])
-
-
-def beliefs(filter_: PoseFilter, up_source: Array, up_target: Array) -> Sequence[Belief]:
-    """The mixture as relative poses of the sensors, most likely first."""
-    return tuple(
-        Belief(from_levelled(m, C, up_source, up_target), float(w))
-        for m, C, w in zip(filter_.means, filter_.covariances, filter_.weights, strict=True)
-    )

@@ -14,11 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..matching.checks import check_count, check_interval
 from ..matching.graph import Matching, ObjectGraph
-from ..matching.pose import Array, RelativePose, adjoint, exp_se3, invert
+from ..matching.pose import Array, RelativePose, adjoint, exp_se3, invert, skews
 from .groups import Groups, group_detections
 from .objects import FusedObjects, fuse_given, relative_pose
-from .registration import RegistrationError, log_se3, register_points, rotation_between
+from .registration import RegistrationError, free_directions, log_se3, orthonormal, register_points, upright
 
 FLOOR = 1e-10
 """m^2 added to every covariance before it is inverted."""
@@ -63,7 +64,14 @@ def refine(
         frame: the robot in whose sensor frame everything is expressed.
         gate, trust_own: as in `fuse`, applied with the given poses before the joint estimate.
         huber: Mahalanobis distance beyond which a measurement's influence stops growing; None = least squares.
+        iterations: most Gauss-Newton steps.
+
+    Raises:
+        ValueError: a robot that does not exist, or an option out of its range.
     """
+    if huber is not None:
+        check_interval("huber", huber, "(0, inf)")
+    check_count("iterations", iterations)
     groups = matchings if isinstance(matchings, Groups) else group_detections([len(g) for g in graphs], matchings)
     if not 0 <= frame < len(graphs):
         raise ValueError(f"frame must be a robot in 0..{len(graphs) - 1}, got {frame}")
@@ -80,7 +88,7 @@ def refine(
     taken = 0
     for _ in range(iterations):
         H, g, _ = solver.linearise(state)
-        step = _solve(H, g)
+        step = _inverse(H) @ g
         state = solver.moved(state, step)
         taken += 1
         if np.abs(step).max(initial=0.0) < 1e-10:
@@ -120,11 +128,7 @@ class _Problem:
             index = groups.members[present[:, k], robot]
             q[present[:, k], k] = graph.positions[index]
             C[present[:, k], k] = graph.full_covariances()[index]
-            if level:
-                free[k, :3, :3] = np.eye(3)
-                free[k, 3:, 3] = graph.up
-            else:
-                free[k] = np.eye(6)
+            free[k] = free_directions(graph.up if level else None)
         return cls(placed, placed.index(frame), q, C, present, free)
 
 
@@ -173,10 +177,8 @@ class _Solver:
         R, t = state[:, :3, :3], state[:, :3, 3]
         local = np.einsum("pji,mpj->mpi", R, objects[:, None] - t)
         m, P = local.shape[:2]
-        K = np.zeros((m, P, 3, 3))
-        K[..., 0, 1], K[..., 0, 2], K[..., 1, 2] = -local[..., 2], local[..., 1], -local[..., 0]
-        K[..., 1, 0], K[..., 2, 0], K[..., 2, 1] = local[..., 2], -local[..., 1], local[..., 0]
-        return np.concatenate([np.broadcast_to(R, (m, P, 3, 3)), -R @ K], axis=-1)
+        turns = -R @ skews(local.reshape(-1, 3)).reshape(m, P, 3, 3)
+        return np.concatenate([np.broadcast_to(R, (m, P, 3, 3)), turns], axis=-1)
 
     def linearise(self, state: Array) -> tuple[Array, Array, float]:
         """Gauss-Newton's H and g over the moving poses' free directions, and the cost."""
@@ -208,6 +210,7 @@ class _Solver:
         return H.reshape(size, size), g.ravel(), cost
 
     def moved(self, state: Array, step: Array) -> Array:
+        """The poses after a step over the moving poses' free directions."""
         out = state.copy()
         for k, part in zip(self.moving, step.reshape(len(self.moving), self.problem.free.shape[2]), strict=True):
             out[k] = state[k] @ exp_se3(self.problem.free[k] @ part)
@@ -227,16 +230,14 @@ class _Solver:
         return FusedObjects(frame, objects[keep], C[keep], groups.members[keep], used[keep], groups.scores[keep])
 
     def relative_poses(self, state: Array, covariance: Array, frame: int) -> dict[tuple[int, int], RelativePose]:
+        """(frame, j) -> pose of robot j, with its block of the poses' joint covariance."""
         p = self.problem
         d = p.free.shape[2]
         out = {}
         for n, k in enumerate(self.moving):
             block = covariance[n * d : (n + 1) * d, n * d : (n + 1) * d]
             C = p.free[k] @ block @ p.free[k].T
-            T = state[k].copy()
-            U, _, Vt = np.linalg.svd(T[:3, :3])
-            T[:3, :3] = U @ Vt
-            out[frame, p.placed[k]] = RelativePose(T, 0.5 * (C + C.T))
+            out[frame, p.placed[k]] = RelativePose(orthonormal(state[k]), 0.5 * (C + C.T))
         return out
 
 
@@ -261,27 +262,23 @@ def _initial_poses(
             if relative is not None:
                 T[j] = T[best] @ relative
                 grown = True
-    return {j: _level(graphs, frame, j, pose) for j, pose in T.items()}
+    return {j: pose if j == frame else upright(pose, _ups(graphs[frame], graphs[j])) for j, pose in T.items()}
 
 
-def _level(graphs: Sequence[ObjectGraph], frame: int, j: int, T: Array) -> Array:
-    """The pose, tilted so that gravity agrees."""
-    up_frame, up = graphs[frame].up, graphs[j].up
-    if j == frame or up_frame is None or up is None:
-        return T
-    out = T.copy()
-    out[:3, :3] = rotation_between(T[:3, :3] @ up, up_frame) @ T[:3, :3]
-    return out
+def _ups(source: ObjectGraph, target: ObjectGraph) -> tuple[Array, Array] | None:
+    """Gravity's opposite in both frames, None unless both know it."""
+    return None if source.up is None or target.up is None else (source.up, target.up)
 
 
 def _registered(graphs: Sequence[ObjectGraph], groups: Groups, i: int, j: int) -> Array | None:
+    """Pose (4, 4) of robot j in robot i's frame from the objects that both see; None where these do not fix it."""
     both = groups.members[(groups.members[:, i] >= 0) & (groups.members[:, j] >= 0)]
     a, b = both[:, i], both[:, j]
     source, target = graphs[i], graphs[j]
-    up = None if source.up is None or target.up is None else (source.up, target.up)
     C_a, C_b = source.full_covariances()[a], target.full_covariances()[b]
+    p, q = source.positions[a], target.positions[b]
     try:
-        return register_points(source.positions[a], C_a, target.positions[b], C_b, up=up).pose.T_source_target
+        return register_points(p, C_a, q, C_b, up=_ups(source, target)).pose.T_source_target
     except RegistrationError:
         return None
 
@@ -300,12 +297,6 @@ def _only(kept: FusedObjects, groups: Groups) -> Groups:
         if tuple(row) in lookup:
             out[k] = members[lookup[tuple(row)]]
     return Groups(out, groups.scores)
-
-
-def _solve(H: Array, g: Array) -> Array:
-    if len(g) == 0:
-        return np.zeros(0)
-    return np.asarray(_inverse(H) @ g)
 
 
 def _inverse(H: Array) -> Array:

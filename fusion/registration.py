@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..matching.checks import check_count, check_interval
 from ..matching.graph import Matching, ObjectGraph
 from ..matching.pose import Array, RelativePose, exp_se3, invert, rotation_from_vector, skews
 
@@ -35,14 +36,12 @@ class Registered:
         residuals: (k, 3) m, source minus mapped target, source axes.
         squared_distances: (k,) squared Mahalanobis distances of the residuals, without the pose's own uncertainty.
         weights: (k,) in [0, 1]: 1 = fully trusted, below = an outlier's influence was reduced.
-        log_evidence_quadratic: half the minimum of the quadratic cost, prior included.
     """
 
     pose: RelativePose
     residuals: Array
     squared_distances: Array
     weights: Array
-    log_evidence_quadratic: float
 
 
 def register(
@@ -112,11 +111,17 @@ def register_points(
         p, C_p: (k, 3) m and (k, 3, 3) m^2, source frame.
         q, C_q: the same in the target frame.
         up: gravity's opposite in the source's and in the target's frame, unit vectors (3,) each.
+        prior, huber, iterations: as in `register`.
+
+    Raises:
+        RegistrationError: as `register`.
+        ValueError: huber or iterations out of range.
     """
-    if huber is not None and huber <= 0:
-        raise ValueError(f"huber must be positive, got {huber}")
-    T = _start(p, q, up) if prior is None else _start_from(prior.T_source_target, up)
-    free = _free_directions(up)
+    if huber is not None:
+        check_interval("huber", huber, "(0, inf)")
+    check_count("iterations", iterations)
+    T = _start(p, q, up) if prior is None else upright(prior.T_source_target, up)
+    free = free_directions(None if up is None else up[1])
     believed: tuple[Array, Array] | None = None
     if prior is not None:
         information: Array = np.linalg.inv(prior.covariance + 1e-12 * np.eye(6)).astype(np.float64)
@@ -124,20 +129,18 @@ def register_points(
     for _ in range(iterations):
         H, g = _normal_equations(T, p, C_p, q, C_q, huber)[:2]
         if believed is not None:
-            H_prior, g_prior, _ = _prior_equations(T, *believed)
+            H_prior, g_prior = _prior_equations(T, *believed)
             H, g = H + H_prior, g + g_prior
         step = free @ np.linalg.solve(free.T @ H @ free, free.T @ g)
         T = T @ exp_se3(step)
         if np.abs(step).max(initial=0.0) < 1e-12:
             break
     H, _, residuals, squared, weights = _normal_equations(T, p, C_p, q, C_q, huber)
-    quadratic = 0.5 * float(weights @ squared)
     if believed is not None:
-        H_prior, _, quadratic_prior = _prior_equations(T, *believed)
-        H, quadratic = H + H_prior, quadratic + quadratic_prior
+        H = H + _prior_equations(T, *believed)[0]
     covariance = free @ np.linalg.inv(free.T @ H @ free) @ free.T
-    pose = RelativePose(_orthonormal(T), 0.5 * (covariance + covariance.T))
-    return Registered(pose, residuals, squared, weights, quadratic)
+    pose = RelativePose(orthonormal(T), 0.5 * (covariance + covariance.T))
+    return Registered(pose, residuals, squared, weights)
 
 
 def log_se3(T: Array) -> Array:
@@ -145,13 +148,13 @@ def log_se3(T: Array) -> Array:
     return np.concatenate([T[:3, 3], _rotation_vector(T[:3, :3])])
 
 
-def _prior_equations(T: Array, T_prior: Array, information: Array) -> tuple[Array, Array, float]:
-    """H (6, 6), g (6,) and half the squared distance of T from T_prior, whose right perturbation has `information`."""
+def _prior_equations(T: Array, T_prior: Array, information: Array) -> tuple[Array, Array]:
+    """H (6, 6) and g (6,) at T of a prior about T_prior, whose right perturbation has `information`."""
     xi = log_se3(invert(T_prior) @ T)
     J = np.eye(6)
     J[:3, :3] = T_prior[:3, :3].T @ T[:3, :3]
     weighted = J.T @ information
-    return weighted @ J, -weighted @ xi, 0.5 * float(xi @ information @ xi)
+    return weighted @ J, -weighted @ xi
 
 
 def _normal_equations(
@@ -196,6 +199,7 @@ def _start(p: Array, q: Array, up: tuple[Array, Array] | None) -> Array:
 
 
 def _kabsch(p: Array, q: Array) -> Array:
+    """Rotation (3, 3) that brings q (k, 3) nearest to p (k, 3), both centred (Kabsch 1976)."""
     spread = np.linalg.svd(q, compute_uv=False)
     if spread[1] <= SPREAD_TOLERANCE * max(spread[0], 1e-300):
         raise RegistrationError("the matched objects stand in one line: a rotation about it stays open")
@@ -217,22 +221,21 @@ def _heading(p: Array, q: Array, up: tuple[Array, Array]) -> Array:
     return rotation_from_vector(np.arctan2(sine, cosine) * u) @ align
 
 
-def _start_from(T: Array, up: tuple[Array, Array] | None) -> Array:
-    """The prior's pose, tilted so that gravity agrees on both sides."""
-    if up is None:
-        return T.copy()
-    start = T.copy()
-    start[:3, :3] = rotation_between(T[:3, :3] @ up[1], up[0]) @ T[:3, :3]
-    return start
+def upright(T: Array, up: tuple[Array, Array] | None) -> Array:
+    """The pose (4, 4), tilted so that gravity agrees; `up` in the source's and the target's frame, None = unknown."""
+    out = T.copy()
+    if up is not None:
+        out[:3, :3] = rotation_between(T[:3, :3] @ up[1], up[0]) @ T[:3, :3]
+    return out
 
 
-def _free_directions(up: tuple[Array, Array] | None) -> Array:
+def free_directions(up: Array | None) -> Array:
     """Basis (6, d) of the right perturbations that are estimated: all, or translation and rotation about target up."""
     if up is None:
         return np.eye(6)
     free = np.zeros((6, 4))
     free[:3, :3] = np.eye(3)
-    free[3:, 3] = up[1]
+    free[3:, 3] = up
     return free
 
 
@@ -262,7 +265,8 @@ def _rotation_vector(R: Array) -> Array:
     return np.pi * axis * np.where(signs == 0, 1.0, signs)
 
 
-def _orthonormal(T: Array) -> Array:
+def orthonormal(T: Array) -> Array:
+    """The pose (4, 4) with the nearest rotation in place of one that has drifted."""
     U, _, Vt = np.linalg.svd(T[:3, :3])
     out = T.copy()
     out[:3, :3] = U @ Vt

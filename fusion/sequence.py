@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from ..matching.bayes_solve import decode
+from ..matching.checks import check_count, check_interval
 from ..matching.graph import Matcher, Matching, ObjectGraph
-from ..matching.pose import Array, RelativePose, invert
+from ..matching.pose import Array, RelativePose
 from .posefilter import Choice, Explained, PoseFilter, PoseFilterOptions, from_levelled, level_motion, to_levelled
 from .registration import RegistrationError, register
 
@@ -38,6 +39,9 @@ class PairOptions:
         min_registered: matches a matcher without poses must give for one to be estimated.
         map_independence: share of what matching the local maps says in a frame that is new.
         beside_maps: in place of the filter's `independence` for views matched beside maps, which hold them too.
+
+    Raises:
+        ValueError: a value out of its range.
     """
 
     filter: PoseFilterOptions = field(default_factory=PoseFilterOptions)
@@ -51,6 +55,16 @@ class PairOptions:
     min_registered: int = 4
     map_independence: float = 0.05
     beside_maps: float = 0.1
+
+    def __post_init__(self) -> None:
+        for name in ("trust", "refuse", "asked", "least_score"):
+            check_interval(name, getattr(self, name), "[0, 1]")
+        check_interval("widen", self.widen, "(0, inf)")
+        check_interval("common", self.common, "(0, 1)")
+        check_count("max_asked", self.max_asked, 0)
+        check_count("min_registered", self.min_registered, 0)
+        for name in ("map_independence", "beside_maps"):
+            check_interval(name, getattr(self, name), "(0, 1]")
 
 
 class PairTracker:
@@ -196,6 +210,7 @@ class PairTracker:
         return matching
 
     def _explained(self, component: int, matching: Matching) -> Explained:
+        """What a matching made with a component as prior says of the frame."""
         assert self._ups is not None
         mean, covariance = self.filter.means[component], self.filter.covariances[component]
         if matching.pose is not None and len(matching) >= 2:
@@ -227,6 +242,7 @@ class PairTracker:
             )
 
     def _absorb(self, found: list[tuple[RelativePose, float]], independence: float | None = None) -> Choice:
+        """Give the filter the proposed poses of a frame."""
         assert self._ups is not None
         return self.filter.update(*_levelled(found, *self._ups), independence)
 
@@ -284,8 +300,3 @@ def propose(
         return [(register(source, target, matching, huber=2.0), 0.5 * probability)]
     except RegistrationError:
         return []
-
-
-def relative_motion(T_before: Array, T_now: Array) -> Array:
-    """Own motion (4, 4) between two poses in one world frame: the `odometry` they would give."""
-    return invert(T_before) @ T_now

@@ -32,9 +32,17 @@ def fuse_team(
             it: None.
         pose_covariances: (6, 6) of each pose.
         matchings: (i, j) -> Matching, i < j. Of more than two robots only consistent groups are fused.
-        gain: "covariance", "joint" or "paper", see `covis.fusion.objects`; what the poses contradict is left out, but
+        gain: as in `fuse`, see `covis.fusion.objects`; what the poses contradict is left out, but
             for "paper".
+
+    Raises:
+        ValueError: other numbers of poses or covariances than of graphs; as `fuse`.
     """
+    if not len(graphs) == len(poses) == len(pose_covariances):
+        raise ValueError(
+            f"every robot has a graph, a pose and a covariance, "
+            f"got {len(graphs)}, {len(poses)} and {len(pose_covariances)}"
+        )
     sizes = [len(graph) for graph in graphs]
     groups = group_detections(sizes, consistent(matchings, sizes) if len(graphs) > 2 else matchings)
     relative = {

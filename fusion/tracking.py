@@ -13,6 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from ..matching.checks import check_count, check_interval, finite, shaped
 from ..matching.pose import Array
 
 
@@ -27,6 +28,9 @@ class TrackerOptions:
         confirm_hits: measurements that confirm a track.
         timeout_s: a confirmed track unseen for longer dies; a tentative one after `tentative_timeout_s`.
         history_s: how far back late measurements are still handled; older ones are dropped.
+
+    Raises:
+        ValueError: a value out of its range.
     """
 
     acceleration_std: float = 1.0
@@ -39,10 +43,9 @@ class TrackerOptions:
 
     def __post_init__(self) -> None:
         for name in ("acceleration_std", "initial_speed_std", "timeout_s", "tentative_timeout_s", "history_s"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} must be non-negative, got {getattr(self, name)}")
-        if self.gate <= 0 or self.confirm_hits < 1:
-            raise ValueError(f"gate must be positive and confirm_hits at least 1, got {self.gate}, {self.confirm_hits}")
+            check_interval(name, getattr(self, name), "[0, inf]")
+        check_interval("gate", self.gate, "(0, inf]")
+        check_count("confirm_hits", self.confirm_hits)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,12 +56,24 @@ class Batch:
         time: s, when they were measured.
         positions: (n, 3) m, the tracker's frame. covariances: (n, 3, 3) m^2.
         classes: (n,) int64, or None; measurements of another class than the track's are not associated with it.
+
+    Raises:
+        ValueError: shapes that do not fit, or a value that is not finite.
     """
 
     time: float
     positions: Array
     covariances: Array
     classes: NDArray[np.int64] | None = None
+
+    def __post_init__(self) -> None:
+        check_interval("time", self.time, "(-inf, inf)")
+        positions = finite(self.positions, "positions")
+        n = len(positions) if positions.ndim else 0
+        object.__setattr__(self, "positions", shaped(positions, "positions", (n, 3)))
+        object.__setattr__(self, "covariances", shaped(self.covariances, "covariances", (n, 3, 3)))
+        if self.classes is not None and np.shape(self.classes) != (n,):
+            raise ValueError(f"classes must have shape ({n},), got {np.shape(self.classes)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +100,7 @@ class Tracks:
 
     @classmethod
     def none(cls, time: float = -np.inf) -> Tracks:
+        """No track."""
         empty = np.zeros(0, dtype=np.int64)
         return cls(time, empty, np.zeros((0, 6)), np.zeros((0, 6, 6)), empty, np.zeros(0), empty, 0)
 
@@ -102,6 +118,7 @@ class Tracks:
         return self.covariances[:, :3, :3]
 
     def take(self, keep: NDArray[np.bool_]) -> Tracks:
+        """The tracks where `keep` (n,) holds."""
         return Tracks(
             self.time,
             self.ids[keep],
@@ -144,11 +161,7 @@ class Tracker:
 
         Returns:
             (n,) id of the track each measurement went to, as of now; -1 for all of a batch older than the history.
-
-        Raises:
-            ValueError: shapes that do not fit, or a time that is not finite.
         """
-        _check(batch)
         newest = self._history[-1].batch.time if self._history else -np.inf
         if batch.time < newest - self.options.history_s:
             self.dropped += 1
@@ -173,10 +186,9 @@ class Tracker:
             As `update`.
 
         Raises:
-            ValueError: as `update`; or `same` is more than either batch has.
+            ValueError: `same` is more than either batch has.
             KeyError: no batch of that time is in the history.
         """
-        _check(batch)
         index = next((k for k, past in enumerate(self._history) if past.batch.time == batch.time), None)
         if index is None:
             raise KeyError(f"no batch of time {batch.time} is in the history")
@@ -199,6 +211,7 @@ class Tracker:
         raise KeyError(f"no batch of time {time} is in the history")
 
     def _replay(self, state: Tracks, later: list[_Past]) -> None:
+        """Take in again what came after the state."""
         for past in later:
             _, state = self._advance(state, past.batch, past.labels)
         self.tracks = state
@@ -357,16 +370,3 @@ def _kalman_update(state: Array, P: Array, position: Array, noise: Array) -> Non
     A = np.eye(6)
     A[:, :3] -= K
     P[:] = A @ P @ A.T + K @ np.ascontiguousarray(noise) @ K.T
-
-
-def _check(batch: Batch) -> None:
-    n = len(batch.positions)
-    if batch.positions.shape != (n, 3) or batch.covariances.shape != (n, 3, 3):
-        raise ValueError(
-            f"a batch needs positions (n, 3) and covariances (n, 3, 3), "
-            f"got {batch.positions.shape} and {batch.covariances.shape}"
-        )
-    if batch.classes is not None and batch.classes.shape != (n,):
-        raise ValueError(f"classes must have shape ({n},), got {batch.classes.shape}")
-    if not np.isfinite(batch.time):
-        raise ValueError(f"a batch's time must be finite, got {batch.time}")

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from .candidates import MAX_CANDIDATES, affinity_matrix, assignment, check_size, distance_variance_m2, mean_agreement
+from .checks import check_interval
 from .graph import Matcher, Matching, ObjectGraph, check_comparable
 from .pose import Array, RelativePose
 from .rrwm import distance_width
@@ -81,6 +82,7 @@ def pygm(
     """
     check_comparable(source, target, prior)
     check_size(f"pygm:{solver}", source, target, MAX_CANDIDATES)
+    check_interval("attribute_weight", attribute_weight, "[0, inf)")
     n, m = len(source), len(target)
     if n == 0 or m == 0:
         return Matching.empty()
@@ -133,9 +135,16 @@ def kiss_matcher(
 
     Returns:
         Matches it keeps as inliers of one rigid motion, each object once; score 1.
+
+    Raises:
+        ValueError: a parameter out of range, too many objects, different attribute classes.
     """
     check_comparable(source, target, prior)
     check_size("kiss-matcher", source, target, MAX_CANDIDATES)
+    check_interval("min_similarity", min_similarity, "[0, 1]")
+    check_interval("resolution_sigmas", resolution_sigmas, "(0, inf)")
+    if resolution_m is not None:
+        check_interval("resolution_m", resolution_m, "(0, inf)")
     if min(len(source), len(target)) < 3:
         return Matching.empty()
     package: Any = import_module("kiss_matcher")
@@ -167,10 +176,12 @@ def _inliers(candidates: Any, distance: Array, gate_m: float) -> Matching:
 
 
 def _clean(soft: Any) -> Array:
+    """Non-negative, 0 for NaN."""
     return np.nan_to_num(np.maximum(np.asarray(soft, dtype=np.float64), 0.0))
 
 
 def _need(module: str, package: str, name: str) -> None:
+    """Raises MissingPackageError saying how to get `package` unless its module can be imported."""
     try:
         import_module(module)
     except ImportError as error:

@@ -16,6 +16,7 @@ from .bayes_overlap import overlap_features
 from .bayes_prepare import LOG_2PI, Problem, Settings, levelling_rotation, prepare, ranges, reach_of
 from .bayes_solve import Modes, Prior, decode, mix, solve_levelled, solve_spatial
 from .bayes_view import View
+from .checks import check_count, check_interval
 from .graph import DEFAULT_BEARING_STD_RAD, Hypothesis, Matching, ObjectGraph, check_comparable
 from .pose import Array, RelativePose
 
@@ -101,19 +102,45 @@ def bayes(
     Raises:
         ValueError: graphs of different classes, or an option out of its range.
     """
-    _check_options(min_score, common_probability, right_angles, screened, refined)
     check_comparable(source, target, prior)
+    if min_score is not None:
+        check_interval("min_score", min_score, "[0, 1]")
+    check_interval("common_probability", common_probability, "(0, 1)")
+    check_interval("right_angles", right_angles, "[0, 1)")
+    check_interval("bearing_std_rad", bearing_std_rad, "[0, inf)")
+    check_interval("class_sharpness", class_sharpness, "[0, inf)")
+    check_interval("mislabel", mislabel, "[0, 1]")
+    check_interval("extent", extent, "[0, inf)")
+    check_interval("depth_offset", depth_offset, "[0, inf)")
+    check_interval("depth_offset_std", depth_offset_std, "[0, inf)")
+    check_interval("scale_std", scale_std, "[0, inf)")
+    check_interval("detection", detection, "(0, 1)")
+    check_count("screened", screened)
+    check_count("refined", refined)
+    check_count("max_hypotheses", max_hypotheses)
     n, m = len(source), len(target)
     if n == 0 or m == 0:
         return Matching.empty()
+    # Floats, also where whole numbers are given: for other types Numba would compile everything anew.
     q = Settings(
-        class_sharpness, mislabel, 4.0, 3.0, 0.8, 1.2, 1.5, extent, depth_offset, depth_offset_std, scale_std, 0.031
+        class_sharpness=float(class_sharpness),
+        mislabel=float(mislabel),
+        overlap_alpha=4.0,
+        overlap_beta=3.0,
+        match_bonus=0.8,
+        view_bonus=1.2,
+        initial_log_odds=1.5,
+        extent=float(extent),
+        depth_offset=float(depth_offset),
+        depth_offset_std=float(depth_offset_std),
+        scale_std=float(scale_std),
+        robot_extent=0.031,
     )
     if source.covariances is not None and target.covariances is not None:
-        q = q._replace(extent=REPORTED_EXTENT * extent)
+        q = q._replace(extent=REPORTED_EXTENT * q.extent)
     gravity = source.up is not None and target.up is not None
     L_a, L_b = _levelling(source, gravity), _levelling(target, gravity)
-    view_a, view_b = _views(source, target, L_a, L_b, detection)
+    view_a, view_b = _views(source, target, L_a, L_b, float(detection))
 
     seen = view_a.known > 0 and view_b.known > 0
     kind = kind_of(source, target, gravity, seen, prior is not None)
@@ -125,7 +152,7 @@ def bayes(
             L_a,
             *_arrays(target, scale),
             L_b,
-            bearing_std_rad**2,
+            float(bearing_std_rad) ** 2,
             gravity,
             source.intrinsics is not None and target.intrinsics is not None,
             seen,
@@ -137,7 +164,7 @@ def bayes(
         pose_prior = _pose_prior(prior, problem, L_a, L_b, gravity)
         return problem, solve(problem, pose_prior, view_a, view_b, q, screened, refined)
 
-    problem, found = explain(1.0, scale_std)
+    problem, found = explain(1.0, q.scale_std)
     explanations = [(problem, found)]
     if rescale and found.log_evidence.max(initial=-math.inf) < DOUBTFUL:
         explanations += [_improbable(*explain(*x)) for x in ALTERNATIVES]
@@ -177,19 +204,6 @@ def heading_log_prior(R: Array, right_angles: float) -> Array:
     off = ((yaw + math.pi / 4) % (math.pi / 2) - math.pi / 4) / RIGHT_ANGLE_STD_RAD
     peak = math.pi / 2 / (RIGHT_ANGLE_STD_RAD * math.sqrt(2 * math.pi))
     return np.log(1 - right_angles + right_angles * peak * np.exp(-0.5 * off**2))
-
-
-def _check_options(
-    min_score: float | None, common_probability: float, right_angles: float, screened: int, refined: int
-) -> None:
-    if min_score is not None and not 0.0 <= min_score <= 1.0:
-        raise ValueError(f"min_score must lie in [0, 1], got {min_score}")
-    if not 0.0 < common_probability < 1.0:
-        raise ValueError(f"common_probability must lie in (0, 1), got {common_probability}")
-    if not 0.0 <= right_angles < 1.0:
-        raise ValueError(f"right_angles must lie in [0, 1), got {right_angles}")
-    if screened < 1 or refined < 1:
-        raise ValueError(f"screened and refined must be at least 1, got {screened} and {refined}")
 
 
 def _levelling(graph: ObjectGraph, gravity: bool) -> Array:

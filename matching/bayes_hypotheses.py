@@ -234,6 +234,8 @@ def screen(
                     continue
                 sxx, syy, sxy = S_a[i, 0, 0] + pxx, S_a[i, 1, 1] + pyy, S_a[i, 0, 1] + pxy
                 det = sxx * syy - sxy * sxy
+                if not det > 0:
+                    continue
                 chi2 = (syy * rx * rx - 2 * sxy * rx * ry + sxx * ry * ry) / det
                 if chi2 > 12.0:
                     continue

@@ -198,7 +198,7 @@ def class_evidence(
         best = 0
         for x in range(c):
             value = a[k, x] if k < n else b[k - n, x]
-            q[k, x] = (max(value, 1e-12) / top) ** power if top > 0 else 1.0
+            q[k, x] = (max(value, 1e-12) / top) ** power if top > 1e-12 else 1.0
             total += q[k, x]
             if q[k, x] > q[k, best]:
                 best = x

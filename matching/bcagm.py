@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from .candidates import assignment, check_size
+from .checks import check_count
 from .graph import Matching, ObjectGraph, check_comparable
 from .pose import Array, RelativePose
 from .rrwhm import MAX_CANDIDATES, triples
@@ -49,8 +50,7 @@ def bcagm(
     """
     check_comparable(source, target, prior)
     check_size("bcagm", source, target, MAX_CANDIDATES)
-    if iterations < 1:
-        raise ValueError(f"iterations must be at least 1, got {iterations}")
+    check_count("iterations", iterations)
     n, m = len(source), len(target)
     if min(n, m) < 3:
         return Matching.empty()

@@ -1,15 +1,52 @@
-"""Arrays as users give them, to arrays as the library uses them; what is wrong is named with its value."""
+"""Arrays and options as users give them, to those that the library uses; what is wrong is named with its value."""
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import ArrayLike
+from functools import lru_cache
+from operator import index
 
-from .pose import Array
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+LARGEST = 1e12
+"""Largest size of a coordinate, confidence or feature. Above it sums of products lose what is to be told apart."""
+
+
+def check_interval(name: str, value: float, interval: str) -> None:
+    """Raises ValueError naming the value unless it is a number in the interval, written like "(0, 1]" or "[1, inf)"."""
+    low, high, low_belongs, high_belongs = _bounds(interval)
+    try:
+        above = value >= low if low_belongs else value > low
+        below = value <= high if high_belongs else value < high
+        inside = bool(above and below)
+    except (TypeError, ValueError):  # a string, an array
+        inside = False
+    if not inside:
+        raise ValueError(f"{name} must lie in {interval}, got {value!r}")
+
+
+@lru_cache
+def _bounds(interval: str) -> tuple[float, float, bool, bool]:
+    low, high = interval[1:-1].split(",")
+    return float(low), float(high), interval[0] == "[", interval[-1] == "]"
+
+
+def check_count(name: str, value: int, least: int = 1) -> None:
+    """Raises ValueError naming the value unless it is a whole number of at least `least`."""
+    try:
+        enough = index(value) >= least
+    except TypeError:
+        enough = False
+    if not enough:
+        raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
 
 
 def numbers(values: ArrayLike, name: str) -> Array:
     """As float64 array. Raises ValueError naming `name` unless `values` is a regular array of real numbers."""
+    if np.ma.is_masked(values):
+        raise ValueError(f"{name} must not be masked, got {np.ma.count_masked(values)} masked values")
     try:
         array = np.asarray(values)
     except ValueError as error:  # rows of different lengths
@@ -26,6 +63,23 @@ def finite(values: ArrayLike, name: str) -> Array:
         where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise ValueError(f"{name} must be finite, got {array[where]} at {where}")
     return array
+
+
+def bounded(values: ArrayLike, name: str) -> Array:
+    """`finite`, and no larger than `LARGEST`. Raises ValueError naming the value and where it stands."""
+    array = finite(values, name)
+    if np.abs(array).max(initial=0.0) > LARGEST:
+        where = tuple(int(i) for i in np.argwhere(np.abs(array) > LARGEST)[0])
+        raise ValueError(f"{name} must not exceed {LARGEST:g}, got {array[where]:g} at {where}")
+    return array
+
+
+def shaped(values: ArrayLike, name: str, shape: tuple[int, ...]) -> Array:
+    """`finite`, of the given shape. Raises ValueError naming `name`."""
+    array = numbers(values, name)
+    if array.shape != shape:
+        raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
+    return finite(array, name)
 
 
 def for_each(values: ArrayLike, name: str, n: int) -> Array:
@@ -74,9 +128,7 @@ def variances(values: ArrayLike, name: str, n: int) -> Array:
 
 def unit_vector(values: ArrayLike, name: str) -> Array:
     """(3,) scaled to length 1. Raises ValueError where the length is off by more than a hundredth."""
-    array = finite(values, name)
-    if array.shape != (3,):
-        raise ValueError(f"{name} must have shape (3,), got {array.shape}")
+    array = shaped(values, name, (3,))
     length = float(np.linalg.norm(array))
     if abs(length - 1) > 1e-2:
         raise ValueError(f"{name} must be a unit vector, its length is {length:.3g}")

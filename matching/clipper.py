@@ -12,6 +12,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from .candidates import MAX_CANDIDATES, check_size, distance_variance_m2
+from .checks import check_count, check_interval
 from .graph import Matching, ObjectGraph, check_comparable
 from .pose import Array, RelativePose
 from .similarity import attribute_similarity, distances
@@ -55,23 +56,26 @@ def clipper(
     """
     check_comparable(source, target, prior)
     check_size("clipper", source, target, MAX_CANDIDATES)
-    if not 0 <= min_similarity <= 1:
-        raise ValueError(f"min_similarity must lie in [0, 1], got {min_similarity}")
+    check_interval("min_similarity", min_similarity, "[0, 1]")
+    check_interval("sigma_factor", sigma_factor, "(0, inf)")
+    check_interval("epsilon_sigmas", epsilon_sigmas, "(0, inf)")
+    check_interval("min_distance_m", min_distance_m, "[0, inf)")
+    check_count("min_matches", min_matches)
     if len(source) == 0 or len(target) == 0:
         return Matching.empty()
     s, t = distances(source.positions), distances(target.positions)
     if sigma_m is None:
         sigma_m = sigma_factor * float(np.sqrt(distance_variance_m2(source, target, s, t)))
+    check_interval("sigma_m", sigma_m, "(0, inf)")
     epsilon_m = epsilon_sigmas * sigma_m if epsilon_m is None else epsilon_m
-    if not (sigma_m > 0 and epsilon_m > 0):
-        raise ValueError(f"sigma_m and epsilon_m must be positive, got {sigma_m} and {epsilon_m}")
+    check_interval("epsilon_m", epsilon_m, "(0, inf)")
     A = attribute_similarity(source.attributes, target.attributes)
     candidates = np.argwhere(min_similarity <= A)
     if len(candidates) == 0:
         return Matching.empty()
     M = consistency(s, t, candidates, sigma_m, epsilon_m, min_distance_m)
     chosen = densest_clique(M)
-    if len(chosen) < max(min_matches, 1):
+    if len(chosen) < min_matches:
         return Matching.empty()
     among = M[np.ix_(chosen, chosen)]
     others = max(len(chosen) - 1, 1)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .checks import check_covariances, finite, for_each, numbers, pixels, unit_vector, variances
+from .checks import bounded, check_covariances, finite, for_each, numbers, pixels, shaped, unit_vector, variances
 from .pose import Array, RelativePose, check_pose, transform
 
 DEFAULT_BEARING_STD_RAD = 0.007
@@ -34,8 +34,8 @@ class ObjectGraph:
         horizontal_fov_rad: optional full horizontal field of view, radians; of use only with `forward` and `up`.
 
     Raises:
-        ValueError: a wrong shape, something that is no number, a value that is not finite, a negative variance, or a
-            matrix that is no covariance.
+        ValueError: a wrong shape, something that is no number, a value that is not finite or above
+            `covis.matching.checks.LARGEST`, a negative variance, or a matrix that is no covariance.
     """
 
     positions: Array
@@ -52,12 +52,12 @@ class ObjectGraph:
 
     def __post_init__(self) -> None:
         put = object.__setattr__
-        positions = finite(self.positions, "positions")
+        positions = bounded(self.positions, "positions")
         if positions.ndim != 2 or positions.shape[1] != 3:
             raise ValueError(f"positions must have shape (n, 3), got {positions.shape}")
         n = len(positions)
         put(self, "positions", positions)
-        attributes = finite(self.attributes, "attributes")
+        attributes = bounded(self.attributes, "attributes")
         if attributes.ndim != 2 or len(attributes) != n or attributes.shape[1] < 1:
             raise ValueError(f"attributes must have shape ({n}, c) with c >= 1, got {attributes.shape}")
         if (attributes < 0).any():
@@ -73,7 +73,7 @@ class ObjectGraph:
             if getattr(self, name) is not None:
                 put(self, name, unit_vector(getattr(self, name), name))
         if self.embedding is not None:
-            embedding = finite(self.embedding, "embedding")
+            embedding = bounded(self.embedding, "embedding")
             if embedding.ndim != 2 or len(embedding) != n:
                 raise ValueError(f"embedding must have shape ({n}, e), got {embedding.shape}")
             put(self, "embedding", embedding)
@@ -85,10 +85,10 @@ class ObjectGraph:
         if self.image_size is not None:
             put(self, "image_size", pixels(self.image_size))
         if self.horizontal_fov_rad is not None:
-            fov = float(finite(self.horizontal_fov_rad, "horizontal_fov_rad"))
+            fov = shaped(self.horizontal_fov_rad, "horizontal_fov_rad", ())
             if not 0 < fov <= 2 * np.pi:
                 raise ValueError(f"horizontal_fov_rad must lie in (0, 2 pi], got {fov}")
-            put(self, "horizontal_fov_rad", fov)
+            put(self, "horizontal_fov_rad", float(fov))
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -205,7 +205,7 @@ class Matching:
             pairs = np.zeros((0, 2), dtype=np.int64)
         if pairs.ndim != 2 or pairs.shape[1] != 2 or not np.issubdtype(pairs.dtype, np.integer):
             raise ValueError(f"pairs must be integers of shape (k, 2), got {pairs.dtype} {pairs.shape}")
-        scores = np.asarray(self.scores, dtype=np.float64)
+        scores = numbers(self.scores, "scores")
         if scores.shape != (len(pairs),):
             raise ValueError(f"scores must have shape ({len(pairs)},), got {scores.shape}")
         if len(pairs):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from .checks import check_interval
 from .graph import Matching, ObjectGraph, PriorRequiredError, check_comparable
 from .pose import RelativePose, transform
 
@@ -30,13 +31,12 @@ def hungarian(
 
     Raises:
         PriorRequiredError: no prior given.
-        ValueError: gate_m is not positive.
+        ValueError: gate_m is not positive and finite, or different attribute classes.
     """
     check_comparable(source, target, prior)
     if prior is None:
         raise PriorRequiredError("hungarian needs a relative pose: give a prior, or run with --pose known")
-    if not gate_m > 0:
-        raise ValueError(f"gate_m must be positive, got {gate_m}")
+    check_interval("gate_m", gate_m, "(0, inf)")
     if len(source) == 0 or len(target) == 0:
         return Matching.empty()
     mapped = transform(prior.T_source_target, target.positions)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from .candidates import check_size, distance_variance_m2
+from .checks import check_count, check_interval
 from .graph import Matching, ObjectGraph, check_comparable
 from .pose import Array, RelativePose
 from .similarity import distances
@@ -55,10 +56,11 @@ def icp(
         ValueError: a parameter out of range, or different attribute classes.
     """
     check_comparable(source, target, prior)
-    if restarts < 1 or iterations < 1:
-        raise ValueError(f"restarts and iterations must be at least 1, got {restarts} and {iterations}")
-    if not 0 <= gate_shrink < 1:
-        raise ValueError(f"gate_shrink must lie in [0, 1), got {gate_shrink}")
+    check_count("restarts", restarts)
+    check_count("iterations", iterations)
+    check_interval("tolerance", tolerance, "[0, inf)")
+    check_interval("gate_sigmas", gate_sigmas, "(0, inf)")
+    check_interval("gate_shrink", gate_shrink, "[0, 1)")
     if translations not in ("centroids", "objects"):
         raise ValueError(f"translations must be 'centroids' or 'objects', got {translations!r}")
     n, m = len(source), len(target)
@@ -70,8 +72,7 @@ def icp(
     if gate_m is None:
         variance = distance_variance_m2(source, target, distances(p), distances(q))
         gate_m = gate_sigmas * float(np.sqrt(variance))
-    if not gate_m > 0:
-        raise ValueError(f"the gate must be positive, got {gate_m} m")
+    check_interval("gate_m", gate_m, "(0, inf)")
     R, t = _starts(source, target, prior, restarts, translations)
     final_gate = np.inf if translations == "centroids" and prior is None else gate_m
     # At first, what an initial rotation half-way between two starts displaces may still pull.

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from .candidates import affinity_matrix, assignment, check_size
+from .checks import check_interval
 from .graph import Matching, ObjectGraph, check_comparable
 from .pose import Array, RelativePose
 from .rrwhm import MAX_CANDIDATES, hypergraph_walk, triples
@@ -54,9 +55,11 @@ def mos(
     """
     check_comparable(source, target, prior)
     check_size("mos", source, target, MAX_CANDIDATES)
-    check_walk(walk_weight, inflation, iterations, sinkhorn_iterations)
-    if len(order_weights) != 3 or min(order_weights) < 0 or not sum(order_weights) > 0:
-        raise ValueError(f"order_weights must be three non-negative numbers, not all zero, got {order_weights}")
+    check_walk(walk_weight, inflation, iterations, sinkhorn_iterations, tolerance, sinkhorn_tolerance)
+    weights = np.asarray(order_weights)
+    if weights.shape != (3,) or not (weights >= 0).all() or not 0 < weights.sum() < np.inf:
+        raise ValueError(f"order_weights must be three non-negative numbers, not all zero, got {order_weights!r}")
+    check_interval("attribute_exponent", attribute_exponent, "[0, inf)")
     n, m = len(source), len(target)
     if n == 0 or m == 0:
         return Matching.empty()

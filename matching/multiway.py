@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from .checks import check_count, check_interval
 from .graph import Matching
 from .multiway_convex import ROUND_AT, relaxed
 from .pose import Array
@@ -53,6 +54,7 @@ def consistent(
         ValueError: a robot or detection out of range, an unknown method, a prior outside (0, 1), or for "convex" more
             detections in one chain of likely matches than `multiway_convex.MAX_CONNECTED`.
     """
+    check_interval("min_score", min_score, "[0, 1]")
     labels = groups(matchings, sizes, method=method, match_prior=match_prior)
     scores = _joint_scores(matchings, sizes)
     start = _starts(sizes)
@@ -106,8 +108,9 @@ def is_consistent(matchings: Mapping[Pair, Matching], sizes: Sequence[int]) -> b
 
 
 def _check(matchings: Mapping[Pair, Matching], sizes: Sequence[int], match_prior: float) -> None:
-    if not 0.0 < match_prior < 1.0:
-        raise ValueError(f"match_prior must lie in (0, 1), got {match_prior}")
+    check_interval("match_prior", match_prior, "(0, 1)")
+    for n in sizes:
+        check_count("sizes", n, 0)
     for pair, matching in matchings.items():
         robots = range(len(sizes))
         if not (isinstance(pair, tuple) and len(set(pair)) == len(pair) == 2 and all(i in robots for i in pair)):

@@ -21,6 +21,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from .checks import check_interval
 from .pose import Array
 from .similarity import triangle_distance
 
@@ -85,12 +86,8 @@ def coefficients(
         raise ValueError(f"scaling must be one of {SCALINGS}, got {scaling!r}")
     if count_penalty not in COUNT_PENALTIES:
         raise ValueError(f"count_penalty must be one of {COUNT_PENALTIES}, got {count_penalty!r}")
-    for name, value in (
-        ("uncertainty_weight", uncertainty_weight),
-        ("noncovisibility_weight", noncovisibility_weight),
-    ):
-        if not (np.isfinite(value) and value >= 0):
-            raise ValueError(f"{name} must be finite and non-negative, got {value}")
+    check_interval("uncertainty_weight", uncertainty_weight, "[0, inf)")
+    check_interval("noncovisibility_weight", noncovisibility_weight, "[0, inf)")
     m = np.arange(largest + 1, dtype=np.float64)
     out = np.zeros((largest + 1, 5))
     if scaling == "sum":

@@ -12,9 +12,9 @@ from math import cos, sin, sqrt
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from .checks import Array, shaped
 
 ROTATION_TOLERANCE = 1e-3
 
@@ -77,13 +77,9 @@ def adjoint(T_a_b: Array) -> Array:
     return out
 
 
-def check_pose(T: Array, name: str) -> Array:
+def check_pose(pose: ArrayLike, name: str) -> Array:
     """The pose as float64 (4, 4). Raises ValueError naming `name` unless it is a finite rigid motion."""
-    T = np.asarray(T, dtype=np.float64)
-    if T.shape != (4, 4):
-        raise ValueError(f"{name} must have shape (4, 4), got {T.shape}")
-    if not np.isfinite(T).all():
-        raise ValueError(f"{name} must be finite, got\n{T}")
+    T = shaped(pose, name, (4, 4))
     R = T[:3, :3]
     error = float(np.abs(R @ R.T - _EYE3).max())
     if error > ROTATION_TOLERANCE or np.linalg.det(R) < 0 or not np.allclose(T[3], (0, 0, 0, 1)):
@@ -91,20 +87,17 @@ def check_pose(T: Array, name: str) -> Array:
     return T
 
 
-def check_covariance(covariance: Array, name: str, size: int = 6) -> Array:
-    """As float64 (size, size). Raises ValueError naming `name` unless finite, symmetric and positive semidefinite."""
-    covariance = np.asarray(covariance, dtype=np.float64)
-    if covariance.shape != (size, size):
-        raise ValueError(f"{name} must have shape ({size}, {size}), got {covariance.shape}")
-    if not np.isfinite(covariance).all():
-        raise ValueError(f"{name} must be finite")
-    scale = max(float(np.abs(covariance).max()), 1e-12)
-    if np.abs(covariance - covariance.T).max() > 1e-6 * scale:
-        raise ValueError(f"{name} must be symmetric")
-    lowest = float(np.linalg.eigvalsh(covariance)[0])
+def check_covariance(covariance: ArrayLike, name: str) -> Array:
+    """As float64 (6, 6). Raises ValueError naming `name` unless finite, symmetric and positive semidefinite."""
+    C = shaped(covariance, name, (6, 6))
+    scale = max(float(np.abs(C).max()), 1e-12)
+    skew = float(np.abs(C - C.T).max())
+    if skew > 1e-6 * scale:
+        raise ValueError(f"{name} must be symmetric, it differs from its transpose by {skew:.3g}")
+    lowest = float(np.linalg.eigvalsh(C)[0])
     if lowest < -1e-6 * scale:
         raise ValueError(f"{name} must be positive semidefinite, its lowest eigenvalue is {lowest:.3g}")
-    return covariance
+    return C
 
 
 @dataclass(frozen=True)
@@ -128,12 +121,23 @@ class RelativePose:
 
     @classmethod
     def between(
-        cls, T_world_source: Array, covariance_source: Array, T_world_target: Array, covariance_target: Array
+        cls,
+        T_world_source: ArrayLike,
+        covariance_source: ArrayLike,
+        T_world_target: ArrayLike,
+        covariance_target: ArrayLike,
     ) -> RelativePose:
-        """Relative pose of two independent world poses, covariances (6, 6) each propagated to first order."""
-        T = invert(T_world_source) @ T_world_target
+        """Relative pose of two independent world poses (4, 4), covariances (6, 6) each propagated to first order.
+
+        Raises:
+            ValueError: a wrong shape, a value that is not finite; as the class.
+        """
+        T_source = shaped(T_world_source, "T_world_source", (4, 4))
+        T = invert(T_source) @ shaped(T_world_target, "T_world_target", (4, 4))
         to_target = adjoint(invert(T))
-        return cls(T, covariance_target + to_target @ covariance_source @ to_target.T)
+        C_source = shaped(covariance_source, "covariance_source", (6, 6))
+        C_target = shaped(covariance_target, "covariance_target", (6, 6))
+        return cls(T, C_target + to_target @ C_source @ to_target.T)
 
     def inverse(self) -> RelativePose:
         """The same knowledge with source and target exchanged."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from .checks import check_interval
 from .graph import Matching, ObjectGraph, check_comparable
 from .pose import Array, RelativePose
 from .similarity import attribute_similarity
@@ -29,10 +30,12 @@ def reid(
 
     Returns:
         Matches with the similarity, clipped to [0, 1], as score. Identical objects are matched arbitrarily.
+
+    Raises:
+        ValueError: min_similarity out of range, different attribute classes, embeddings of different lengths.
     """
-    if not 0.0 <= min_similarity <= 1.0:
-        raise ValueError(f"min_similarity must lie in [0, 1], got {min_similarity}")
     check_comparable(source, target, prior)
+    check_interval("min_similarity", min_similarity, "[0, 1]")
     if len(source) == 0 or len(target) == 0:
         return Matching.empty()
     A = _appearance(source, target, use_embedding)
@@ -43,6 +46,7 @@ def reid(
 
 
 def _appearance(source: ObjectGraph, target: ObjectGraph, use_embedding: bool) -> Array:
+    """Cosine similarities (n, n')."""
     if use_embedding and source.embedding is not None and target.embedding is not None:
         if source.embedding.shape[1] != target.embedding.shape[1]:
             raise ValueError(

@@ -32,6 +32,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from .checks import check_count
 from .graph import Matching, ObjectGraph, check_comparable, generator
 from .objective import Terms, coefficients
 from .objective_state import empty_state, load_match
@@ -113,8 +114,7 @@ def rgm(
         reject_mirrored,
     )
     annealing = Annealing(proposals, start_temperature, end_temperature, acceptance, add_probability, proposal_width)
-    if workers < 1:
-        raise ValueError(f"workers must be at least 1, got {workers}")
+    check_count("workers", workers)
     for name, graph in (("source", source), ("target", target)):
         if len(graph) > MAX_OBJECTS:
             raise ValueError(f"rgm accepts at most {MAX_OBJECTS} objects a side, {name} has {len(graph)}")
@@ -162,4 +162,5 @@ def scores(terms: Terms, match: NDArray[np.int64]) -> Array:
 
 
 def _known(graph: ObjectGraph) -> NDArray[np.int64]:
+    """Which objects have finite variances."""
     return np.flatnonzero(np.isfinite(graph.position_variance) & np.isfinite(graph.attribute_variance))

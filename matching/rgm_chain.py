@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from .checks import check_count, check_interval
 from .objective import Terms, value
 from .objective_state import State, add, best_exchange, best_reassignment, empty_state, load_match, remove
 from .pose import Array
@@ -41,16 +42,12 @@ class Annealing:
     def __post_init__(self) -> None:
         if self.acceptance not in ACCEPTANCES:
             raise ValueError(f"acceptance must be one of {ACCEPTANCES}, got {self.acceptance!r}")
-        if self.proposals is not None and self.proposals < 0:
-            raise ValueError(f"proposals must not be negative, got {self.proposals}")
-        if not 0 < self.end_temperature <= self.start_temperature:
-            raise ValueError(
-                f"need 0 < end_temperature <= start_temperature, got {self.end_temperature}, {self.start_temperature}"
-            )
-        if not 0 < self.add_probability < 1:
-            raise ValueError(f"add_probability must lie in (0, 1), got {self.add_probability}")
-        if not self.proposal_width > 0:
-            raise ValueError(f"proposal_width must be positive, got {self.proposal_width}")
+        if self.proposals is not None:
+            check_count("proposals", self.proposals, 0)
+        check_interval("start_temperature", self.start_temperature, "(0, inf)")
+        check_interval("end_temperature", self.end_temperature, f"(0, {self.start_temperature}]")
+        check_interval("add_probability", self.add_probability, "(0, 1)")
+        check_interval("proposal_width", self.proposal_width, "(0, inf]")
 
     def temperatures(self, n: int) -> Array:
         """T at each proposal."""

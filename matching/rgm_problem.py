@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from .candidates import extent_floor_m2
+from .checks import check_count, check_interval
 from .graph import ObjectGraph
 from .objective import Terms
 from .pose import Array
@@ -57,10 +58,10 @@ class Similarity:
             value = getattr(self, field.name)
             if isinstance(value, bool) or value is None:
                 continue
-            if field.name == "neighbours" and value < 1:
-                raise ValueError(f"neighbours must be at least 1, got {value}")
-            if not value > 0:
-                raise ValueError(f"{field.name} must be positive, got {value}")
+            if field.name == "neighbours":
+                check_count(field.name, value)
+            else:
+                check_interval(field.name, value, "(0, inf]")
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from .candidates import assignment, check_size
+from .checks import check_interval
 from .graph import Matching, ObjectGraph, check_comparable
 from .pose import Array, RelativePose
 from .random_walk import reweighted
@@ -55,7 +56,7 @@ def rrwhm(
     """
     check_comparable(source, target, prior)
     check_size("rrwhm", source, target, MAX_CANDIDATES)
-    check_walk(walk_weight, inflation, iterations, sinkhorn_iterations)
+    check_walk(walk_weight, inflation, iterations, sinkhorn_iterations, tolerance, sinkhorn_tolerance)
     if min(len(source), len(target)) < 3:
         return Matching.empty()
     index, values = triples(source, target, neighbours_factor, angle_width)
@@ -80,15 +81,14 @@ def triples(
     source: ObjectGraph, target: ObjectGraph, neighbours_factor: float, angle_width: float | None
 ) -> tuple[NDArray[np.int32], Array]:
     """Sparse T: candidates (t, 3) and values (t,) in (0, 1], once per triple."""
-    if not neighbours_factor > 0:
-        raise ValueError(f"neighbours_factor must be positive, got {neighbours_factor}")
+    check_interval("neighbours_factor", neighbours_factor, "(0, inf)")
+    if angle_width is not None:
+        check_interval("angle_width", angle_width, "(0, inf)")
     neighbours = max(1, round(neighbours_factor * len(source) * len(target)))
     index, distance = nearest_triples(
         vertex_cosines(source.positions), vertex_cosines(target.positions), neighbours, False
     )
     width = max(float(distance.mean()), 1e-9) if angle_width is None else angle_width
-    if not width > 0:
-        raise ValueError(f"angle_width must be positive, got {angle_width}")
     return index, np.exp(-distance / width)
 
 

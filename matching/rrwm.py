@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from .candidates import MAX_CANDIDATES, assignment, check_size, distance_variance_m2, mean_agreement
+from .checks import check_count, check_interval
 from .graph import Matching, ObjectGraph, check_comparable
 from .pose import Array, RelativePose
 from .random_walk import distance_affinity, reweighted_random_walk
@@ -52,7 +53,8 @@ def rrwm(
     """
     check_comparable(source, target, prior)
     check_size("rrwm", source, target, MAX_CANDIDATES)
-    check_walk(walk_weight, inflation, iterations, sinkhorn_iterations)
+    check_walk(walk_weight, inflation, iterations, sinkhorn_iterations, tolerance, sinkhorn_tolerance)
+    check_interval("attribute_weight", attribute_weight, "[0, inf)")
     if len(source) == 0 or len(target) == 0:
         return Matching.empty()
     s, t = distances(source.positions), distances(target.positions)
@@ -74,17 +76,25 @@ def distance_width(
     source: ObjectGraph, target: ObjectGraph, s: Array, t: Array, width_m2: float | None, factor: float
 ) -> float:
     """gamma of Eq. (2), m^2: as given, or `factor` times the median variance of a candidate."""
-    width = factor * distance_variance_m2(source, target, s, t) if width_m2 is None else width_m2
-    if not (np.isfinite(width) and width > 0):
-        raise ValueError(f"the distance width must be positive, got {width} m^2")
-    return float(width)
+    check_interval("distance_width_factor", factor, "(0, inf)")
+    if width_m2 is None:
+        width_m2 = factor * distance_variance_m2(source, target, s, t)
+    check_interval("distance_width_m2", width_m2, "(0, inf)")
+    return float(width_m2)
 
 
-def check_walk(walk_weight: float, inflation: float, iterations: int, sinkhorn_iterations: int) -> None:
+def check_walk(
+    walk_weight: float,
+    inflation: float,
+    iterations: int,
+    sinkhorn_iterations: int,
+    tolerance: float,
+    sinkhorn_tolerance: float,
+) -> None:
     """Raises ValueError naming the value unless the walk's parameters make sense."""
-    if not 0 <= walk_weight <= 1:
-        raise ValueError(f"walk_weight must lie in [0, 1], got {walk_weight}")
-    if not inflation > 0:
-        raise ValueError(f"inflation must be positive, got {inflation}")
-    if iterations < 1 or sinkhorn_iterations < 1:
-        raise ValueError(f"iterations must be at least 1, got {iterations} and {sinkhorn_iterations}")
+    check_interval("walk_weight", walk_weight, "[0, 1]")
+    check_interval("inflation", inflation, "(0, inf)")
+    check_count("iterations", iterations)
+    check_count("sinkhorn_iterations", sinkhorn_iterations)
+    check_interval("tolerance", tolerance, "[0, inf)")
+    check_interval("sinkhorn_tolerance", sinkhorn_tolerance, "[0, inf)")

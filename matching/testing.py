@@ -101,6 +101,9 @@ def degenerate_problems() -> Iterator[MatchingProblem]:
     yield MatchingProblem("partly infinite variance", graph(cloud, position_variance=partly), graph(cloud))
     far = cloud * 1e6
     yield MatchingProblem("far away", graph(far), graph(far))
+    yield MatchingProblem("far from both robots", graph(cloud + 1e8), graph(other + 1e8))
+    faint = np.full((6, 3), 1e-300)
+    yield MatchingProblem("faint attributes", graph(cloud, attributes=faint), graph(other, attributes=faint[1:].copy()))
     nobody = np.zeros((6, 3))
     yield MatchingProblem(
         "attributes all zero", graph(cloud, attributes=nobody), graph(other, attributes=nobody[1:].copy())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from .checks import check_interval
 from .pose import Array
 
 
@@ -31,8 +32,7 @@ def certainty(uncertainty: Array, width: float) -> Array:
     The weights of Eq. (10) and (11) are products of this: W^d_{ii',jj'} = w_ii' w_jj' and W^t_{ii',jj',kk'} =
     w_ii' w_jj' w_kk' with w = certainty(U, width), as the exponential of a sum; they are never stored.
     """
-    if not width > 0:
-        raise ValueError(f"width must be positive, got {width}")
+    check_interval("width", width, "(0, inf]")
     return np.exp(-uncertainty / width)
 
 

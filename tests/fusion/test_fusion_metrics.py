@@ -48,8 +48,23 @@ def test_gospa_agrees_with_stone_soup():
 def test_gospa_of_empty_sets():
     assert gospa(np.zeros((0, 3)), np.zeros((0, 3))).distance == 0
     assert gospa(np.zeros((0, 3)), np.zeros((4, 3)), cutoff=1.0).distance == pytest.approx(np.sqrt(2))
-    with pytest.raises(ValueError, match="cutoff"):
-        gospa(np.zeros((0, 3)), np.zeros((0, 3)), cutoff=0)
+
+
+def test_bad_arguments_are_named():
+    nobody = np.zeros((0, 3))
+    for arguments, message in (
+        ({"cutoff": 0}, r"cutoff must lie in \(0, inf\), got 0"),
+        ({"p": 0.5}, r"p must lie in \[1, inf\), got 0.5"),
+        ({"truths": np.zeros(3)}, r"estimates must be \(n, d\) and truths \(m, d\), got \(0, 3\) and \(3,\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            gospa(**({"estimates": nobody, "truths": nobody} | arguments))
+    with pytest.raises(ValueError, match="n must be a whole number of at least 1, got 0"):
+        nees_interval(0, 3)
+    with pytest.raises(ValueError, match=r"errors must be \(n, d\) .* got \(2, 3\) and \(3, 3\)"):
+        nees(np.zeros((2, 3)), np.eye(3))
+    with pytest.raises(ValueError, match=r"both be \(n, d\), got \(1, 3\) and \(2, 3\)"):
+        displacement_errors(np.zeros((1, 3)), np.zeros((2, 3)))
 
 
 def test_gospa_does_not_depend_on_order():

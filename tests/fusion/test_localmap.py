@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from covis.fusion.localmap import LocalMap
+from covis.fusion.localmap import LocalMap, MapOptions
 from covis.fusion.sequence import PairTracker
 from covis.matching import METHODS, ObjectGraph
 from covis.matching.pose import Array, exp_se3, invert, transform
@@ -83,6 +83,12 @@ def test_what_moves_and_what_is_gone_is_not_kept():
         memory.predict(np.eye(4), UP)
         remembered = memory.see(graph(noisy(rng, still[1:]), fov=2.0))
     assert len(remembered) == 2
+
+
+@pytest.mark.parametrize(("option", "value"), [("gate", -1.0), ("trials", 1.5), ("doubt", np.nan), ("moved_m", np.inf)])
+def test_bad_options_are_named_with_their_value(option, value):
+    with pytest.raises(ValueError, match=f"^{option} must .*, got {value}$"):
+        MapOptions(**{option: value})
 
 
 def test_an_empty_frame_is_survived():

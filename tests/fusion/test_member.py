@@ -168,6 +168,21 @@ def test_own_pose_belief_is_consistent_and_better_than_one_fix():
     assert np.std(np.array(errors)[:, :2]) < 0.5 * np.std(np.array(fixes)[:, :2])
 
 
+@pytest.mark.parametrize(
+    ("options", "option", "value"),
+    [
+        (MemberOptions, "gate", 1.0),
+        (MemberOptions, "least_agreement", 1.5),
+        (MemberOptions, "repeated", -0.1),
+        (MemberOptions, "gain", "best"),
+        (OdometryNoise, "heading_rad", np.nan),
+    ],
+)
+def test_bad_options_are_named_with_their_value(options, option, value):
+    with pytest.raises(ValueError, match=f"^{option} must .*, got {value!r}$"):
+        options(**{option: value})
+
+
 def test_time_must_go_on():
     member = Member(0, 2, same_order)
     look = World(7, 2).look(0)

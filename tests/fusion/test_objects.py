@@ -6,6 +6,7 @@ from covis.fusion.gaussian import fuse_gaussians, fuse_isotropic
 from covis.fusion.groups import group_detections
 from covis.fusion.metrics import nees_per_dof
 from covis.fusion.objects import relative_pose
+from covis.fusion.team import fuse_team
 from covis.matching.graph import Matching, ObjectGraph
 from covis.matching.pose import RelativePose, exp_se3, invert, transform
 
@@ -88,7 +89,17 @@ def test_bad_matchings_raise():
         group_detections([1, 1], {(0, 1): matching((0, 1))})
     with pytest.raises(ValueError, match="2 robots"):
         group_detections([1, 1], {(0, 2): matching((0, 0))})
+    with pytest.raises(TypeError, match=r"matchings\[\(0, 1\)\] must be a Matching, got list"):
+        group_detections([1, 1], {(0, 1): [(0, 0)]})
     graph = ObjectGraph.from_positions(np.ones((1, 3)))
+    with pytest.raises(TypeError, match=r"graphs\[1\] must be an ObjectGraph, got ndarray"):
+        fuse([graph, np.ones((1, 3))], {}, {})
+    with pytest.raises(TypeError, match=r"poses\[\(0, 1\)\] must be a RelativePose, got ndarray"):
+        fuse([graph, graph], {(0, 1): np.eye(4)}, {})
+    with pytest.raises(ValueError, match=r"gate must lie in \(0, 1\), got 1"):
+        fuse([graph], {}, {}, gate=1.0)
+    with pytest.raises(ValueError, match="got 1, 2 and 1"):
+        fuse_team([graph], [None, None], [None], {})
     with pytest.raises(ValueError, match="gain"):
         fuse([graph], {}, {}, gain="best")
     with pytest.raises(ValueError, match="frame"):

@@ -5,7 +5,6 @@ from covis.fusion.posefilter import (
     Explained,
     PoseFilter,
     PoseFilterOptions,
-    beliefs,
     from_levelled,
     heading,
     level_motion,
@@ -57,8 +56,9 @@ def test_prediction_follows_both_odometries():
         motions = [turned(0.2 * rng.normal(), Z_UP, 0.3 * rng.normal(size=3)) for _ in range(2)]
         T_world = [T @ M for T, M in zip(T_world, motions, strict=True)]
         filter_.predict(*motions)
-    (belief,) = beliefs(filter_, Z_UP, Z_UP)
-    np.testing.assert_allclose(belief.pose.T_source_target, invert(T_world[0]) @ T_world[1], atol=1e-9)
+    assert len(filter_.weights) == 1
+    pose = from_levelled(filter_.means[0], filter_.covariances[0], Z_UP, Z_UP)
+    np.testing.assert_allclose(pose.T_source_target, invert(T_world[0]) @ T_world[1], atol=1e-9)
 
 
 def test_prediction_is_consistent_monte_carlo():
@@ -259,11 +259,25 @@ def test_motions_are_levelled():
 
 
 @pytest.mark.parametrize(
-    ("field", "value"), [("lost", 0.0), ("overlooked", 1.0), ("independence", 0.0), ("max_components", 0)]
+    ("options", "field", "value"),
+    [
+        (PoseFilterOptions, "lost", 0.0),
+        (PoseFilterOptions, "overlooked", 1.0),
+        (PoseFilterOptions, "independence", 0.0),
+        (PoseFilterOptions, "max_components", 0),
+        (PoseFilterOptions, "walk_std_m", -0.1),
+        (PoseFilterOptions, "odometry_std_rad", np.nan),
+        (PoseFilterOptions, "extent_m", 0.0),
+        (PairOptions, "trust", 1.5),
+        (PairOptions, "widen", 0.0),
+        (PairOptions, "common", 1.0),
+        (PairOptions, "max_asked", 2.5),
+        (PairOptions, "beside_maps", 0.0),
+    ],
 )
-def test_bad_filter_options_raise(field, value):
-    with pytest.raises(ValueError, match=field):
-        PoseFilterOptions(**{field: value})
+def test_bad_options_are_named_with_their_value(options, field, value):
+    with pytest.raises(ValueError, match=f"^{field} must .*, got {value}$"):
+        options(**{field: value})
 
 
 def test_components_are_reweighed_by_what_the_frame_says_under_each():

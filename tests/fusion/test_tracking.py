@@ -155,13 +155,19 @@ def test_prediction_to_a_later_time():
 
 
 def test_bad_batches_and_options_raise():
-    tracker = Tracker()
-    with pytest.raises(ValueError, match="covariances"):
-        tracker.update(Batch(0.0, np.zeros((2, 3)), np.zeros((1, 3, 3))))
-    with pytest.raises(ValueError, match="finite"):
-        tracker.update(Batch(np.nan, np.zeros((0, 3)), np.zeros((0, 3, 3))))
-    with pytest.raises(ValueError, match="timeout_s"):
-        TrackerOptions(timeout_s=-1)
+    for bad, message in (
+        ((0.0, np.zeros((2, 3)), np.zeros((1, 3, 3))), r"covariances must have shape \(2, 3, 3\), got \(1, 3, 3\)"),
+        ((0.0, np.zeros((2, 2)), np.zeros((2, 3, 3))), r"positions must have shape \(2, 3\), got \(2, 2\)"),
+        ((0.0, 1.0, np.zeros((0, 3, 3))), r"positions must have shape \(0, 3\), got \(\)"),
+        ((0.0, [[0.0, np.nan, 0.0]], np.zeros((1, 3, 3))), r"positions must be finite, got nan at \(0, 1\)"),
+        ((np.nan, np.zeros((0, 3)), np.zeros((0, 3, 3))), "time must lie in .* got nan"),
+        ((0.0, np.zeros((1, 3)), np.zeros((1, 3, 3)), np.zeros(2)), r"classes must have shape \(1,\), got \(2,\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Batch(*bad)
+    for field, value in (("timeout_s", -1), ("gate", np.nan), ("confirm_hits", 0)):
+        with pytest.raises(ValueError, match=f"^{field} must .*, got {value}$"):
+            TrackerOptions(**{field: value})
     labels, tracks = step(Tracks.none(), Batch(0.0, np.zeros((0, 3)), np.zeros((0, 3, 3))), TrackerOptions())
     assert len(labels) == len(tracks) == 0
     assert len(predict(tracks, 1.0, 1.0)) == 0

@@ -45,6 +45,9 @@ def test_empty_graph_is_valid():
         ),
         ("covariances", [np.eye(3)] * 2 + [np.diag([1, 1, -2])], "positive semidefinite, got an eigenvalue -2 at 2"),
         ("covariances", np.eye(3), r"covariances must have shape \(3, 3, 3\), got \(3, 3\)"),
+        ("positions", np.full((3, 3), 1e13), r"positions must not exceed 1e\+12, got 1e\+13 at \(0, 0\)"),
+        ("attributes", np.full((3, 2), 1e300), r"attributes must not exceed 1e\+12, got 1e\+300 at \(0, 0\)"),
+        ("positions", np.ma.masked_equal(np.eye(3), 1), "positions must not be masked, got 3 masked values"),
         ("up", np.array([0.0, 0.0, 2.0]), "up must be a unit vector, its length is 2"),
         ("embedding", np.ones((2, 4)), r"embedding must have shape \(3, e\)"),
         ("intrinsics", np.zeros((3, 3)), "positive focal lengths"),
@@ -52,6 +55,7 @@ def test_empty_graph_is_valid():
         ("image_size", (640,), r"image_size must be \(width, height\) >= 1 in whole pixels, got \(640,\)"),
         ("image_size", (640.5, 480), "in whole pixels"),
         ("horizontal_fov_rad", "wide", "horizontal_fov_rad must be real numbers"),
+        ("horizontal_fov_rad", [1.0, 2.0], r"horizontal_fov_rad must have shape \(\), got \(2,\)"),
         ("horizontal_fov_rad", 7.0, r"horizontal_fov_rad must lie in \(0, 2 pi\], got 7.0"),
     ],
 )

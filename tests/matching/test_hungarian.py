@@ -50,5 +50,5 @@ def test_prefers_more_pairs_inside_the_gate_then_least_distance():
 
 def test_gate_must_be_positive():
     g = ObjectGraph.from_positions(np.eye(3))
-    with pytest.raises(ValueError, match="gate_m must be positive, got 0"):
+    with pytest.raises(ValueError, match=r"gate_m must lie in \(0, inf\), got 0"):
         hungarian(g, g, prior=RelativePose(np.eye(4), np.eye(6)), gate_m=0)

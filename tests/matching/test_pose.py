@@ -70,6 +70,8 @@ def test_position_covariances_agree_with_sampling():
     ("T", "message"),
     [
         (np.eye(3), r"must have shape \(4, 4\)"),
+        ([[1], [2, 3]], "T_source_target must be a regular array of numbers"),
+        (None, "T_source_target must be real numbers, got object None"),
         (np.full((4, 4), np.nan), "must be finite"),
         (np.diag([2.0, 1, 1, 1]), "not a rigid motion"),
         (np.diag([-1.0, 1, 1, 1]), "not a rigid motion"),
@@ -85,10 +87,31 @@ def test_bad_poses_are_refused(T, message):
     [
         (np.eye(3), r"must have shape \(6, 6\)"),
         (-np.eye(6), "positive semidefinite"),
-        (np.triu(np.ones((6, 6))), "symmetric"),
+        (np.triu(np.ones((6, 6))), "symmetric, it differs from its transpose by 1"),
         (np.full((6, 6), np.inf), "finite"),
     ],
 )
 def test_bad_covariances_are_refused(covariance, message):
     with pytest.raises(ValueError, match=message):
         RelativePose(np.eye(4), covariance)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        (0, np.eye(3), r"T_world_source must have shape \(4, 4\), got \(3, 3\)"),
+        (1, np.eye(3), r"covariance_source must have shape \(6, 6\), got \(3, 3\)"),
+        (2, np.full((4, 4), np.nan), r"T_world_target must be finite, got nan at \(0, 0\)"),
+        (3, "small", "covariance_target must be real numbers"),
+    ],
+)
+def test_bad_world_poses_are_named(field, value, message):
+    given = [np.eye(4), np.eye(6), np.eye(4), np.eye(6)]
+    given[field] = value
+    with pytest.raises(ValueError, match=message):
+        RelativePose.between(*given)
+
+
+def test_world_poses_may_be_lists():
+    given = [np.eye(4).tolist(), np.eye(6).tolist()] * 2
+    np.testing.assert_array_equal(RelativePose.between(*given).covariance, 2 * np.eye(6))

@@ -393,13 +393,13 @@ def test_too_many_objects_are_refused_with_the_limit():
     ("options", "message"),
     [
         ({"acceptance": "greedy"}, "acceptance must be one of"),
-        ({"proposals": -1}, "proposals must not be negative, got -1"),
+        ({"proposals": -1}, "proposals must be a whole number of at least 0, got -1"),
         ({"end_temperature": 0.0}, "end_temperature"),
         ({"add_probability": 1.0}, "add_probability must lie in"),
-        ({"proposal_width": 0.0}, "proposal_width must be positive"),
-        ({"distance_width_m2": -1.0}, "distance_width_m2 must be positive, got -1"),
-        ({"neighbours": 0}, "neighbours must be at least 1"),
-        ({"workers": 0}, "workers must be at least 1"),
+        ({"proposal_width": 0.0}, r"proposal_width must lie in \(0, inf\], got 0"),
+        ({"distance_width_m2": -1.0}, r"distance_width_m2 must lie in \(0, inf\], got -1"),
+        ({"neighbours": 0}, "neighbours must be a whole number of at least 1, got 0"),
+        ({"workers": 0}, "workers must be a whole number of at least 1, got 0"),
     ],
 )
 def test_bad_options_name_the_value(options, message):
