@@ -76,7 +76,8 @@ def gospa(estimates: ArrayLike, truths: ArrayLike, *, cutoff: float = 2.0, p: fl
     check_interval("cutoff", cutoff, "(0, inf)")
     check_interval("p", p, "[1, inf)")
     x, t = numbers(estimates, "estimates"), numbers(truths, "truths")
-    if x.ndim != 2 or t.ndim != 2 or x.shape[1] != t.shape[1]:
+    given = [a for a in (x, t) if a.size]
+    if any(a.ndim != 2 or a.shape[1] != given[0].shape[1] for a in given):
         raise ValueError(f"estimates must be (n, d) and truths (m, d), got {x.shape} and {t.shape}")
     n, m = len(x), len(t)
     localisation, assigned = 0.0, 0

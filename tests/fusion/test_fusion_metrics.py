@@ -47,6 +47,7 @@ def test_gospa_agrees_with_stone_soup():
 
 def test_gospa_of_empty_sets():
     assert gospa(np.zeros((0, 3)), np.zeros((0, 3))).distance == 0
+    assert gospa([], [[0.0, 0.0, 0.0]]).n_missed == 1
     assert gospa(np.zeros((0, 3)), np.zeros((4, 3)), cutoff=1.0).distance == pytest.approx(np.sqrt(2))
 
 
@@ -56,6 +57,7 @@ def test_bad_arguments_are_named():
         ({"cutoff": 0}, r"cutoff must lie in \(0, inf\), got 0"),
         ({"p": 0.5}, r"p must lie in \[1, inf\), got 0.5"),
         ({"truths": np.zeros(3)}, r"estimates must be \(n, d\) and truths \(m, d\), got \(0, 3\) and \(3,\)"),
+        ({"estimates": np.zeros((2, 2)), "truths": np.zeros((4, 3))}, r"got \(2, 2\) and \(4, 3\)"),
     ):
         with pytest.raises(ValueError, match=message):
             gospa(**({"estimates": nobody, "truths": nobody} | arguments))
