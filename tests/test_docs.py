@@ -21,11 +21,10 @@ import typer
 from markdown_it import MarkdownIt
 from typer.testing import CliRunner
 
-from covis.evaluation.calibration_fit import GENERATED
 from covis.evaluation.methods import Method
 from covis.evaluation.settings import SCENE_NAMES
 from covis.evaluation.suites import SUITES
-from covis.evaluation.synthetic import problem_names
+from covis.evaluation.synthetic import PREFIX, problem_names
 from covis.scripts.main import app
 from covis.scripts.speed import AREAS
 
@@ -126,7 +125,7 @@ def parsed(words: list[str]) -> tuple[list[str], dict[str, Any]]:
 def is_generated(target: str) -> bool:
     """Whether a target, with a shell's braces, names generated problems."""
     pattern = re.sub(r"{(.*?)}", lambda braces: f"({braces[1].replace(',', '|')})", target)
-    return any(re.fullmatch(pattern, GENERATED + problem) for problem in problem_names())
+    return any(re.fullmatch(pattern, PREFIX + problem) for problem in problem_names())
 
 
 def check_parameters(name: list[str], params: dict[str, Any], page: Page) -> None:
