@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from importlib import metadata
 from typing import Annotated
 
@@ -58,4 +59,5 @@ def options(
 
 
 def main() -> None:
+    sys.path.append("")  # so that `--method mine:match` finds mine.py of the folder where it is called
     app()

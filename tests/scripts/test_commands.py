@@ -80,6 +80,20 @@ def test_a_method_that_fails_costs_no_other_its_row(small_dataset, tmp_path):
     assert "| Failed |" in (out / "report.md").read_text()
 
 
+@pytest.mark.parametrize("workers", ["1", "2"])
+def test_a_method_of_the_folder_where_it_is_called(small_dataset, tmp_path, workers):
+    """The command is not a module of that folder, as `python -m` would make it: hence -P."""
+    (tmp_path / "mine_here.py").write_text(
+        "from covis.matching import Matching\n\n\n"
+        "def match(source, target, *, prior=None, rng=None):\n    return Matching.empty()\n"
+    )
+    command = [sys.executable, "-P", "-m", "covis.scripts", "benchmark", str(small_dataset), "--workers", workers]
+    command += ["--method", "mine_here:match", "--json", "-"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["rows"][0]["n_failed"] == 0
+
+
 def fails(source, target, *, prior=None, rng=None):
     raise KeyError("no")
 
