@@ -1,5 +1,4 @@
-"""Curves over all methods: precision against recall, reliability, errors over range and occlusion, time against "
-"F1."""
+"""Curves over all methods: precision and recall, reliability, errors over range and occlusion, time against F1."""
 
 from __future__ import annotations
 
@@ -38,9 +37,16 @@ def panel(group: Group, figure: Element, legend: Sequence[tuple[int, str, str]] 
     return h("figure", {"class": "panel", "data-t": group.number}, figure, caption)
 
 
-def section(identifier: str, title: str, note: str, panels: Child) -> Element:
+def section(identifier: str, title: str, note: str, panels: Child, legend: Child = None) -> Element:
+    """Figures under a heading; `legend`, where they have none of their own, is shown once for all of them."""
     grid = h("div", {"class": "panels"}, panels)
-    return h("section", {"id": identifier}, h("h2", None, title), h("p", {"class": "note"}, note), grid)
+    return h("section", {"id": identifier}, h("h2", None, title), h("p", {"class": "note"}, note), legend, grid)
+
+
+def _common_legend(groups: Sequence[Group]) -> Element:
+    """Every method of the groups with its mark."""
+    labels = {e.method: e.label for g in groups for e in g.entries}
+    return h("ul", {"class": "legend"}, [h("li", {"data-m": m}, key(m), h("span", None, x)) for m, x in labels.items()])
 
 
 # Precision and recall
@@ -48,9 +54,8 @@ def section(identifier: str, title: str, note: str, panels: Child) -> Element:
 
 def precision_recall(groups: Sequence[Group]) -> Element:
     note = (
-        "Matches pooled over all pairs of views, taken in order of their scores; recall is over the objects that "
-        "both robots detected. "
-        "The mark is where the method itself stops. Beside each name: average precision."
+        "Matches pooled over all pairs of views, taken in order of their scores; recall is over the objects that both "
+        "robots detected. The mark is where the method itself stops. Beside each name: average precision."
     )
     return section("precision-recall", "Precision and recall", note, [_pr_panel(g) for g in groups])
 
@@ -113,8 +118,7 @@ def _thinned(n: int) -> NDArray[np.int64]:
 def calibration(groups: Sequence[Group]) -> Element:
     note = (
         "Matches in ten bins of equal number by score: the share that was right against the mean score. On the "
-        "diagonal a score is a "
-        "probability; below it, a boast. Beside each name: expected calibration error (ECE)."
+        "diagonal a score is a probability; below it, a boast. Beside each name: expected calibration error (ECE)."
     )
     return section("calibration", "Are scores probabilities?", note, [_calibration_panel(g) for g in groups])
 
@@ -143,19 +147,19 @@ def difficulty(groups: Sequence[Group]) -> list[Element]:
     out = []
     if errors:
         note = (
-            "Mean distance between estimate and truth over rightly matched objects, in bins of equal number. "
-            "Solid: fused; "
-            "dashed: one robot alone, over the objects of the method with the most of them. Occlusion is the "
-            "share of an object’s outline that something nearer or the image’s edge cuts off."
+            "Mean distance between estimate and truth over rightly matched objects, in bins of equal number. Coloured: "
+            "fused; dashed, without marks: one robot alone, over the objects of the method with the most of them. "
+            "Occlusion is the share of an object’s outline that something nearer or the image’s edge cuts off."
         )
-        out.append(section("error", "Displacement error over range and occlusion", note, errors))
+        title = "Displacement error over range and occlusion"
+        out.append(section("error", title, note, errors, _common_legend(groups)))
     if found:
         note = (
-            "Share of the objects that both robots detected which a method matched rightly, in bins of equal "
-            "number; the larger of "
-            "the two robots’ distances or occlusions counts."
+            "Share of the objects that both robots detected which a method matched rightly, in bins of equal number; "
+            "the larger of the two robots’ distances or occlusions counts."
         )
-        out.append(section("found", "Objects found over range and occlusion", note, found))
+        title = "Objects found over range and occlusion"
+        out.append(section("found", title, note, found, _common_legend(groups)))
     return out
 
 

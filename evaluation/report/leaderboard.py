@@ -51,7 +51,10 @@ COLUMNS = (
     Column("paper", "Recall in the paper's Table 1.", _published(1), kind="paper"),
     Column("ECE", "Expected calibration error of the matches' scores; 0 is calibrated.", _row("ece")),
     Column(
-        "Scene recall", "Right matches of all objects visible to both cameras, detected or not.", _row("scene_recall")
+        "Scene recall",
+        "Right matches over the objects that both cameras show large enough to count, detected or not; above 1 where "
+        "smaller ones are matched, too.",
+        _row("scene_recall"),
     ),
     Column(
         "Alone, m",
@@ -77,7 +80,7 @@ def section(groups: list[Group]) -> Element:
         h(
             "p",
             {"class": "note"},
-            "Counts are pooled over pairs of views. Bars are 95 % bootstrap intervals over episodes; “to the best” is "
+            "Counts are pooled over pairs of views. Bars are 95 % bootstrap intervals over episodes; “to the best” is "
             "the difference of F1 to the highest on the same episodes, with its interval (paired bootstrap), shaded "
             "where noise alone may explain it (the interval holds 0, or p of a paired permutation test is .05 or more)."
             " The oracle and chance do not compete. A diamond is the paper’s F1, from its mean precision and recall; "

@@ -52,7 +52,7 @@ def figure_6(groups: Sequence[Group], images: Images) -> Element | None:
         return None
     note = (
         "One frame of each target’s first episode, the one with most in common. Solid green: right; dashed red: wrong. "
-        "Boxes are detections. The paper’s Fig. 6."
+        "Boxes are detections. The paper’s Fig. 6."
     )
     blocks = [_side_by_side(group, page, images) for group, page in shown]
     return h(

@@ -26,7 +26,7 @@ def figure_7(groups: Sequence[Group]) -> Element | None:
         return None
     note = (
         "What the robots report is made worse by a rate before matching. The paper raises the reported uncertainty by "
-        "0 to 15 % (its Fig. 7); beyond it, the noise itself is raised while the report stays. A flat line is robust. "
+        "0 to 15 % (its Fig. 7); beyond it, the noise itself is raised while the report stays. A flat line is robust. "
         "Beside each name: the change from no disturbance to the strongest."
     )
     return section("robustness", "Robustness", note, panels)

@@ -20,8 +20,7 @@ PALETTE = (
     ("oracle", "#555555", "#c4c4c4"),
     ("random", "#9a9a9a", "#8a8a8a"),
 )
-"""Colours of known methods, light and dark; the same in every report. Marks and dashes tell apart what colours "
-"do not."""
+"""Colours of known methods, light and dark, the same in every report; marks and dashes tell apart what they do not."""
 SPARE = (
     ("#0072b2", "#56b4e9"),
     ("#d55e00", "#ff9350"),

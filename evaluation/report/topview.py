@@ -145,7 +145,7 @@ def observers(group: Group, method: str) -> Element | None:
         parts.append(
             h("g", {"class": f"robot-{i}"}, h("path", {"class": "track", "d": path([view(p) for p in track])}))
         )
-        parts.append(_robot(i, view(track[-1]), pages[0].sights[i].robot))
+    parts += [_robot(i, view(track[-1]), pages[0].sights[i].robot) for i, track in enumerate(tracks)]
     title = f"Observers’ trajectories from above on {group.name}, with matches of {method}"
     return _map(title, [parts, scale_bar(view)])
 
@@ -299,6 +299,7 @@ def trajectories(name: str, found: Sequence[Track], which: str) -> Element:
         parts.append(h("path", {"class": f"estimate {which}", "d": path([view(p) for p in estimates])}))
         at = [view(p) for p in estimates]
         parts.append([h("circle", {"class": f"point {which}", "cx": u, "cy": v, "r": 2.2}) for u, v in at])
-        parts.append(_tag(view(track.truth[0]), f"object {track.identity}"))
+    # Names last, so that no other track covers them.
+    parts += [_tag(view(track.truth[0]), f"object {track.identity}") for track in found]
     what = "one robot alone" if which == "single" else "fused"
     return _map(f"Trajectories from above on {name}: truth and {what}", [parts, scale_bar(view)])

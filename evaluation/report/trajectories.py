@@ -21,7 +21,7 @@ def figure_9(groups: Sequence[Group]) -> Element | None:
     note = (
         f"The first episode from above: the two observers’ paths, and at {topview.SHOWN_FRAMES} instants lines from "
         "each observer to where it alone puts a matched object. Green: right; dashed red joins two places wrongly "
-        "taken for one object. The paper’s Fig. 9."
+        "taken for one object. The paper’s Fig. 9."
     )
     return section("observers", "Observers and their matches", note, panels)
 
@@ -51,7 +51,7 @@ def figure_10(groups: Sequence[Group]) -> Element | None:
         "followed), in the frames in which the best method matched them rightly (the oracle, where it followed none): "
         "as one observer estimates them alone, and fused with the other. Thick line or ring: truth. Shown is the kept "
         "episode in which objects are followed longest; of every unit of the run, the one with the longest shared "
-        "view of a moving object is kept. The paper’s Fig. 10; its case study reports "
+        "view of a moving object is kept. The paper’s Fig. 10; its case study reports "
         f"{single:.1f} mm alone and {fused:.1f} mm fused."
     )
     return section("trajectories", "Trajectories: truth, one robot, fused", note, panels)

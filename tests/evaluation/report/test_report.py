@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 from dataclasses import replace
+from html import escape
 from html.parser import HTMLParser
 
 import numpy as np
@@ -18,7 +19,7 @@ from covis.evaluation.report.html import h, page
 from covis.evaluation.report.leaderboard import signed, verdict
 from covis.evaluation.report.robustness import figure_7, rates
 from covis.evaluation.report.run import Entry, load
-from covis.evaluation.report.topview import best_tracks, episodes
+from covis.evaluation.report.topview import best_tracks, episodes, trajectories
 from covis.evaluation.shards import Shards
 
 from .conftest import METHODS, TARGETS, make_record, rows_of, write_run
@@ -131,6 +132,20 @@ def test_every_section_is_there_and_linked(report):
     assert "abc1234567" in html
     assert "suite trial (version 7)" in html
     assert "3.11.7" in html
+
+
+@pytest.mark.parametrize("identifier", ["error", "found"])
+def test_figures_without_legends_share_one(report, identifier):
+    section = report.html.read_text().split(f'<section id="{identifier}">')[1].split("</section>")[0]
+    (legend,) = re.findall('<ul class="legend">(.*?)</ul>', section)
+    assert re.findall("<span>(.*?)</span>", legend) == [escape(name) for name in METHODS]
+
+
+def test_names_of_tracks_are_drawn_over_all_tracks(run_folder):
+    group = next(g for g in load(run_folder).groups if best_tracks(g, "good")[1])
+    found = best_tracks(group, "good")[1]
+    drawn = [child.get("class") for child in trajectories(group.name, [*found, *found], "fused")]
+    assert drawn.index("tag") > max(k for k, kind in enumerate(drawn) if kind == "point fused")
 
 
 def test_pictures_have_words_for_those_who_cannot_see_them(report):
