@@ -13,6 +13,9 @@ from ..envs.claims import Claims, claims_to_action
 from ..envs.seeding import EpisodeSeeds, Seed
 from .localizer import Localizer
 
+STREAM_KEY = 101
+"""Last word of the localizer's spawn key within an episode's seed."""
+
 
 class LocalizeWrapper(BaseParallelWrapper):
     """Actions shrink to `control` (a Box); the localizer's claims about the last observation go with them.
@@ -57,7 +60,9 @@ class LocalizeWrapper(BaseParallelWrapper):
             self._seeds = EpisodeSeeds.start(seed)
         episode, self._seeds = self._seeds.next()
         # The environment spawns from the episode's seed itself: a key of our own keeps the two streams apart.
-        self._rng = np.random.default_rng(np.random.SeedSequence(episode.entropy, spawn_key=(*episode.spawn_key, _KEY)))
+        self._rng = np.random.default_rng(
+            np.random.SeedSequence(episode.entropy, spawn_key=(*episode.spawn_key, STREAM_KEY))
+        )
         self._localize(observations)
         return observations, infos
 
@@ -100,6 +105,3 @@ class LocalizeWrapper(BaseParallelWrapper):
         observations, infos = self.env.restore_state(state)
         self._rng, self._claims = copy.deepcopy(rng), list(claims)
         return observations, infos
-
-
-_KEY = 101

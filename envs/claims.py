@@ -6,7 +6,7 @@ element p * K + k is slot k towards the p-th partner, partners in ascending orde
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +16,9 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 POSITION_BOUND_M = 1000.0
+"""Farthest position along each axis that can be claimed."""
 VARIANCE_BOUND_M2 = 1e6
+"""Largest variance that can be claimed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +43,7 @@ class Claims:
 
     @classmethod
     def empty(cls, max_detections: int, n_partners: int) -> Claims:
+        """Those of a robot that claims nothing: K empty slots, matched with no slot of any of N-1 partners."""
         K = max_detections
         return cls(
             np.zeros((K, 4)),
@@ -68,6 +71,15 @@ def claims_to_action(claims: Claims, control: ArrayLike) -> dict[str, NDArray[An
         "matches": claims.matches.astype(np.int64).ravel(),
         "match_scores": claims.match_scores.astype(np.float32).ravel(),
     }
+
+
+def silent_actions(
+    agents: Sequence[str], controls: ArrayLike, max_detections: int
+) -> dict[str, dict[str, NDArray[Any]]]:
+    """Actions of all robots by controls (N, d), that claim nothing."""
+    nothing = Claims.empty(max_detections, len(agents) - 1)
+    rows = np.asarray(controls)
+    return {agent: claims_to_action(nothing, row) for agent, row in zip(agents, rows, strict=True)}
 
 
 def action_space(control_size: int, max_detections: int, n_partners: int, width: int, height: int) -> spaces.Dict:

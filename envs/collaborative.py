@@ -8,7 +8,6 @@ from __future__ import annotations
 import copy
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -23,6 +22,7 @@ from .camera.mount import Mount, checked_mounts, kept_picture, with_mounts
 from .camera.raster import Look, intrinsics_from_fov
 from .camera.rig import CameraRig, Exposures
 from .claims import Claims, action_space, decode
+from .episode import Episode, SavedState
 from .figures import N_SUMS, figures, sums
 from .instant import Answered, Instant
 from .observations import SENSORS, Observer, state_size, state_vector
@@ -31,47 +31,8 @@ from .seeding import EpisodeSeeds, Seed
 from .sensing import PoseNoise
 from .worlds.world import Snapshot, World, checked_world
 
-
-@dataclass(eq=False)
-class _Episode:
-    """Everything of the environment itself that changes; a deep copy of it is its saved state.
-
-    `sums` and `totals` (N, N_SUMS) are those of the last step and of the episode, see `figures.sums`; `trail` holds the
-    cameras' places (N, 2) at each instant, m.
-    """
-
-    noise_rng: np.random.Generator
-    id_rng: np.random.Generator
-    exposures: Exposures
-    steps: int
-    claims: list[Claims]
-    score: StepScore | None
-    sums: NDArray[np.float64]
-    totals: NDArray[np.float64]
-    now: Instant
-    before: Instant | None
-    trail: list[NDArray[np.float64]]
-    marked: tuple[Any, Any] | None = None
-
-    def mark(self) -> None:
-        """Remember the random numbers with which the observations are about to be made."""
-        self.marked = self.noise_rng.bit_generator.state, self.id_rng.bit_generator.state
-
-    def rewind(self) -> None:
-        """Go back to the mark, so that the same observations can be made again."""
-        assert self.marked is not None
-        self.noise_rng.bit_generator.state, self.id_rng.bit_generator.state = self.marked
-
-
-@dataclass(frozen=True, eq=False)
-class SavedState:
-    """A state of `CollaborativeEnv.save_state`; it can be pickled. Its contents are no interface."""
-
-    name: str
-    world: Any
-    episode: _Episode
-    agents: tuple[str, ...]
-    seeds: EpisodeSeeds
+LEAST = {"width": 8, "height": 8}
+"""Smallest values of the arguments that are whole numbers; 1 unless it says otherwise."""
 
 
 class CollaborativeEnv(ParallelEnv, EzPickle):
@@ -143,31 +104,11 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
             seed=seed,
             render_mode=render_mode,
         )
-        for label, value, least in (
-            ("width", width, 8),
-            ("height", height, 8),
-            ("max_detections", max_detections, 1),
-            ("max_cycles", max_cycles, 1),
-            ("min_pixels", min_pixels, 1),
-        ):
-            if not isinstance(value, (int, np.integer)) or value < least:
-                raise ValueError(f"{label} must be a whole number >= {least}, got {value!r}")
-        for label, given, kind in (
-            ("pose_noise", pose_noise, PoseNoise),
-            ("look", look, Look),
-            ("effects", effects, EffectRanges),
-        ):
-            if given is not None and not isinstance(given, kind):
-                raise TypeError(f"{label} must be a {kind.__name__} or None, got {given!r}")
-        if reward is not None and not callable(reward):
-            raise TypeError(f"reward must be a function of a StepScore, or None, got {reward!r}")
-        if isinstance(sensors, str) or not isinstance(sensors, Sequence):
-            raise ValueError(f"sensors must be a sequence of names, got {sensors!r}")
-        unknown = [s for s in sensors if s not in SENSORS]
-        if unknown:
-            raise ValueError(f"unknown sensor {unknown[0]!r}; there are {', '.join(SENSORS)}")
-        if render_mode not in (None, "rgb_array", "human"):
-            raise ValueError(f"render_mode must be 'rgb_array', 'human' or None, got {render_mode!r}")
+        _check_numbers(
+            width=width, height=height, max_detections=max_detections, max_cycles=max_cycles, min_pixels=min_pixels
+        )
+        _check_parts(pose_noise=(pose_noise, PoseNoise), look=(look, Look), effects=(effects, EffectRanges))
+        _check_choices(reward, sensors, render_mode)
         self.world = checked_world(make_world())
         self.metadata = {
             "name": name,
@@ -220,7 +161,7 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         )
         self._painter: Any = None
         self._window: Any = None
-        self._episode: _Episode | None = None
+        self._episode: Episode | None = None
         space = action_space(self.world.control_size, self.max_detections, n - 1, self.width, self.height)
         self.action_spaces = dict.fromkeys(self.possible_agents, space)
         self.observation_spaces = dict.fromkeys(self.possible_agents, self._observer.space)
@@ -269,7 +210,7 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         snapshot = self._take_snapshot()
         n = len(self.agents)
         exposures = self._rig.begin(camera_rng)
-        self._episode = _Episode(
+        self._episode = Episode(
             noise_rng=noise_rng,
             id_rng=id_rng,
             exposures=exposures,
@@ -357,13 +298,14 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         if not isinstance(saved, SavedState) or saved.name != self.name:
             what = repr(saved.name) if isinstance(saved, SavedState) else type(saved).__name__
             raise ValueError(f"a state of {self.name!r} is needed, from its save_state(); got {what}")
-        self.world.restore_state(saved.world)  # type: ignore[attr-defined]
+        restore: Any = self.world
+        restore.restore_state(saved.world)
         self._episode = copy.deepcopy(saved.episode)
         self._episode.rewind()
         self.agents, self._seeds = list(saved.agents), saved.seeds
         return self._observe(self._episode), self._infos(self._episode)
 
-    def _running(self, caller: str) -> _Episode:
+    def _running(self, caller: str) -> Episode:
         if self._episode is None:
             raise RuntimeError(f"reset() must be called before {caller}")
         return self._episode
@@ -404,7 +346,7 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
             frames[i] = frame
         return tuple(frames)
 
-    def _observe(self, episode: _Episode) -> dict[str, Any]:
+    def _observe(self, episode: Episode) -> dict[str, Any]:
         episode.mark()
         e = episode
         return {
@@ -412,7 +354,7 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
             for i, agent in enumerate(self.possible_agents)
         }
 
-    def _infos(self, episode: _Episode) -> dict[str, dict[str, float]]:
+    def _infos(self, episode: Episode) -> dict[str, dict[str, float]]:
         """Figures of the last step's claims, and `episode_*` over the episode so far.
 
         Ratios and means of nothing are 0: counts tell them from others. (NaN is not equal to itself: it would break
@@ -497,3 +439,31 @@ class CollaborativeEnv(ParallelEnv, EzPickle):
         if self._window is not None:
             self._window.close()
             self._window = None
+
+
+def _check_numbers(**numbers: Any) -> None:
+    """Raises ValueError for the first that is no whole number, or too small."""
+    for name, value in numbers.items():
+        least = LEAST.get(name, 1)
+        if not isinstance(value, (int, np.integer)) or value < least:
+            raise ValueError(f"{name} must be a whole number >= {least}, got {value!r}")
+
+
+def _check_parts(**parts: tuple[Any, type]) -> None:
+    """Raises TypeError for the first that is neither None nor of its type."""
+    for name, (part, kind) in parts.items():
+        if part is not None and not isinstance(part, kind):
+            raise TypeError(f"{name} must be a {kind.__name__} or None, got {part!r}")
+
+
+def _check_choices(reward: Any, sensors: Any, render_mode: Any) -> None:
+    """Raises TypeError for a reward that cannot be called, ValueError for sensors or a mode that do not exist."""
+    if reward is not None and not callable(reward):
+        raise TypeError(f"reward must be a function of a StepScore, or None, got {reward!r}")
+    if isinstance(sensors, str) or not isinstance(sensors, Sequence):
+        raise ValueError(f"sensors must be a sequence of names, got {sensors!r}")
+    unknown = [s for s in sensors if s not in SENSORS]
+    if unknown:
+        raise ValueError(f"unknown sensor {unknown[0]!r}; there are {', '.join(SENSORS)}")
+    if render_mode not in (None, "rgb_array", "human"):
+        raise ValueError(f"render_mode must be 'rgb_array', 'human' or None, got {render_mode!r}")

@@ -40,7 +40,8 @@ class Mount:
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            if not (isinstance(value, int | float | np.number) and np.isfinite(value)) and value is not None:
+            absent = value is None and field.name == "rate_hz"
+            if not absent and not (isinstance(value, int | float | np.number) and np.isfinite(value)):
                 raise ValueError(f"{field.name} must be a finite number, got {value!r}")
         if not 0 < self.horizontal_fov_rad < np.pi:
             raise ValueError(f"horizontal_fov_rad must be in (0, pi), got {self.horizontal_fov_rad}")

@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from .checks import Range, require
+from .checks import Range, check_preset, require
 from .layout import in_disc
+from .robot_generation import Scene, camera_mount, planar_poses
 from .robot_params import RobotSceneParams
-from .robots import RobotWorld, Scene, State, camera_mount, planar_poses
+from .robots import RobotWorld, State
 from .world import Array
 
 GRAVITY = 9.81
@@ -198,6 +199,4 @@ PRESETS = {
 
 def preset(name: str, **changes: Any) -> AerialGroundParams:
     """The parameters called `name` (easy, paper or hard), some of them changed. Raises ValueError for another name."""
-    if name not in PRESETS:
-        raise ValueError(f"unknown preset {name!r}; aerial_ground has {', '.join(PRESETS)}")
-    return dataclasses.replace(PRESETS[name], **changes)
+    return dataclasses.replace(PRESETS[check_preset("aerial_ground", name, PRESETS)], **changes)

@@ -30,6 +30,13 @@ def check_names(name: str, value: object, known: Collection[str]) -> None:
     require(named, name, value, f"a tuple of some of {', '.join(known)}")
 
 
+def check_preset(scene: str, name: str, known: Collection[str]) -> str:
+    """The name of a preset. Raises ValueError naming the scene and what it has, unless it is `known`."""
+    if name not in known:
+        raise ValueError(f"unknown preset {name!r}; {scene} has {', '.join(known)}")
+    return name
+
+
 def _check_field(name: str, kind: str, value: object) -> None:
     if kind == "int":
         require(_whole(value), name, value, "a whole number, not negative")

@@ -16,6 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from .collision_kernels import touching
 from .driving_maps import RoadMap, Start, road_map
 from .driving_params import CAR, CLASSES, KINDS, PRESETS, WHITE, DrivingParams, Tint, draw_kind, draw_paint, preset
 from .kerbs import Ground, to_world
@@ -23,8 +24,9 @@ from .lighting import sample_light
 from .road_surface import road_surface
 from .street import Catalogue, Street
 from .street_meshes import barrier, building, bus, car, person, post, sign, signal, tree, truck, van
-from .traffic import ConnectedVehicle, FastNetwork, FastRoad, Obstacle, TrafficVehicle, make_road
-from .traffic_kernels import touching
+from .traffic import FastRoad, Obstacle, make_road
+from .traffic_lanes import FastNetwork
+from .traffic_vehicles import ConnectedVehicle, TrafficVehicle
 from .world import Array, Light, Mesh, SceneGenerationError, Snapshot
 
 SIMULATION_HZ = 15

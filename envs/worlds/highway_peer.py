@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from .driving import SIMULATION_HZ, SUBSTEPS, ConnectedDrivingWorld
-from .traffic import ConnectedVehicle
+from .traffic_vehicles import ConnectedVehicle
 
 # isort: split
 from highway_env.envs.intersection_env import MultiAgentIntersectionEnv

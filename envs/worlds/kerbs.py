@@ -10,8 +10,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from .driving_maps import RoadMap
-from .traffic import LaneTable
-from .traffic_kernels import L_LENGTH, L_WIDTH, projected
+from .lane_kernels import L_LENGTH, L_WIDTH, projected
+from .traffic_lanes import LaneTable
 
 Array = NDArray[np.float64]
 

@@ -6,6 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
+from .checks import check_preset
 from .robot_params import RobotSceneParams
 from .robots import RobotWorld
 
@@ -48,6 +49,4 @@ PRESETS = {
 
 def preset(name: str, **changes: Any) -> MultiRobotParams:
     """The parameters called `name` (easy, paper or hard), some of them changed. Raises ValueError for another name."""
-    if name not in PRESETS:
-        raise ValueError(f"unknown preset {name!r}; multi_robot has {', '.join(PRESETS)}")
-    return dataclasses.replace(PRESETS[name], **changes)
+    return dataclasses.replace(PRESETS[check_preset("multi_robot", name, PRESETS)], **changes)

@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
-from .checks import Range
+from .checks import Range, check_preset
 from .robot_params import RobotSceneParams
 from .robots import RobotWorld
 
@@ -72,6 +72,4 @@ PRESETS = {
 
 def preset(name: str, **changes: Any) -> TargetLocalizationParams:
     """The parameters called `name` (easy, paper or hard), some of them changed. Raises ValueError for another name."""
-    if name not in PRESETS:
-        raise ValueError(f"unknown preset {name!r}; target_localization has {', '.join(PRESETS)}")
-    return dataclasses.replace(PRESETS[name], **changes)
+    return dataclasses.replace(PRESETS[check_preset("target_localization", name, PRESETS)], **changes)

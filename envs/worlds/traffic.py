@@ -3,7 +3,7 @@
 `FastRoad` moves the same vehicles by the same rules as highway-env's `Road` and `RegulatedRoad`: per substep it gathers
 their state into one table, and kernels do what highway-env does vehicle by vehicle (projections onto lanes, neighbours,
 the Intelligent Driver Model, steering, the bicycle model, the closest lane, collisions, predicted conflicts). Rare
-decisions (routes, lane changes, who yields) run highway-env's own code. `stock_twin` copies a road into highway-env's
+decisions (routes, lane changes, who yields) run highway-env's own code. `traffic_twin` copies a road into highway-env's
 own classes; the tests drive both side by side. Traffic amplifies a difference in the last bit, so wherever such a
 difference would reach a vehicle's motion the transcendental functions are NumPy's, as in highway-env, and not the
 compiler's. Sums of two products remain: BLAS, which highway-env calls for them, rounds them once on CPUs with AVX-512.
@@ -13,33 +13,14 @@ Everything here is in highway-env's frame (x right, y down on its screen).
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .collision_kernels import collisions, translation
 from .driving_maps import RoadMap  # first: it silences pygame before highway-env imports it
-from .traffic_kernels import (
-    CIRCULAR,
-    L_AMPLITUDE,
-    L_DX,
-    L_DY,
-    L_HEADING,
-    L_KIND,
-    L_LENGTH,
-    L_PHASE,
-    L_PULSATION,
-    L_RADIUS,
-    L_SPEED_LIMIT,
-    L_START_PHASE,
-    L_TURN,
-    L_WIDTH,
-    L_X,
-    L_Y,
-    LANE_COLUMNS,
-    LOOK_AHEAD_S,
-    SINE,
+from .lane_kernels import (
     V_ACCELERATION,
     V_COS,
     V_HEADING,
@@ -53,165 +34,19 @@ from .traffic_kernels import (
     V_X,
     V_Y,
     VEHICLE_COLUMNS,
-    closest_lane,
     closest_lanes,
-    collisions,
-    idm_commands,
-    move,
-    neighbours,
     past_end,
-    predicted_conflicts,
-    situations,
-    translation,
 )
+from .traffic_kernels import LOOK_AHEAD_S, idm_commands, move, neighbours, predicted_conflicts, situations
+from .traffic_lanes import FastNetwork, LaneIndex, LaneTable
+from .traffic_vehicles import ConnectedVehicle, TrafficVehicle
 
 # isort: split
-from highway_env.road.lane import AbstractLane, CircularLane, SineLane, StraightLane
 from highway_env.road.regulation import RegulatedRoad
-from highway_env.road.road import Road, RoadNetwork
-from highway_env.vehicle.behavior import IDMVehicle
-from highway_env.vehicle.kinematics import Vehicle
 from highway_env.vehicle.objects import Landmark, Obstacle
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
-LaneIndex = tuple[str, str, int]
-
-
-class TrafficVehicle(IDMVehicle):
-    """One of highway-env's IDM drivers, with an identity, a kind and its own size.
-
-    Attributes:
-        identity: stable over an episode; -1 until assigned.
-        kind: index into `KINDS`.
-    """
-
-    # highway-env's intersection changes these on its IDMVehicle class for the whole process; ours must not notice.
-    ACC_MAX, COMFORT_ACC_MAX, COMFORT_ACC_MIN = 6.0, 3.0, -5.0
-    DISTANCE_WANTED, TIME_WANTED, DELTA = 10.0, 1.5, 4.0
-
-    def __init__(self, *args: Any, identity: int = -1, kind: int = 0, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.identity = identity
-        self.kind = kind
-
-    def resize(self, length: float, width: float) -> None:
-        """Give this vehicle its own length and width (m); highway-env's dynamics and collisions use them."""
-        self.LENGTH, self.WIDTH = length, width
-        self.diagonal = math.sqrt(length**2 + width**2)
-
-
-class ConnectedVehicle(TrafficVehicle):
-    """A vehicle that we drive: it holds our acceleration and steering, and still knows its route.
-
-    Attributes:
-        cruise_speed: m/s that an IDM driver would not exceed in it, whatever highway-env's rules set.
-    """
-
-    cruise_speed = math.inf
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.enable_lane_change = False
-
-    @property
-    def target_speed(self) -> float:
-        """m/s that an IDM driver would like to go."""
-        return self._target_speed
-
-    @target_speed.setter
-    def target_speed(self, speed: float) -> None:
-        self._target_speed = min(speed, self.cruise_speed)
-
-    def act(self, action: dict[str, float] | None = None) -> None:
-        """Hold `action`; without one, only keep following the route (highway-env's road calls this)."""
-        if action is not None:
-            self.action = dict(action)
-        elif not self.crashed:
-            self.follow_road()
-
-
-class LaneTable:
-    """A road network's lanes as arrays, in highway-env's own order.
-
-    Attributes:
-        rows: (L, 16) geometry, columns L_*.
-        indices: lane index of each row; `row_of` is its inverse.
-        connected: (L, c) rows searched for neighbours of a vehicle on that lane, itself first, -1 padded.
-        offsets: (L, c) m added to the longitudinal coordinate on each of them.
-    """
-
-    def __init__(self, network: RoadNetwork, connected_lanes: bool = False) -> None:
-        lanes = network.lanes_dict()
-        self.indices: list[LaneIndex] = list(lanes)
-        self.lanes: list[AbstractLane] = list(lanes.values())
-        self.row_of = {index: row for row, index in enumerate(self.indices)}
-        self.rows = np.array([_lane_row(lane) for lane in self.lanes])
-        found = [_connections(network, self.row_of, index, connected_lanes) for index in self.indices]
-        width = max(len(f) for f in found)
-        self.connected = np.full((len(found), width), -1, dtype=np.int64)
-        self.offsets = np.zeros((len(found), width))
-        for row, links in enumerate(found):
-            for k, (other, offset) in enumerate(links):
-                self.connected[row, k], self.offsets[row, k] = other, offset
-        self._circular = np.flatnonzero(self.rows[:, L_KIND] == CIRCULAR)
-
-    def angles(self, bodies: Array) -> Array:
-        """Direction (rad) of each body from the centre of each circular lane, (n, L); 0 for other lanes."""
-        out = np.zeros((len(bodies), len(self.rows)))
-        lanes = self.rows[self._circular]
-        out[:, self._circular] = np.arctan2(bodies[:, V_Y, None] - lanes[:, L_Y], bodies[:, V_X, None] - lanes[:, L_X])
-        return out
-
-
-def _lane_row(lane: AbstractLane) -> Array:
-    row = np.zeros(LANE_COLUMNS)
-    row[L_LENGTH], row[L_WIDTH] = lane.length, lane.width_at(0.0)
-    row[L_SPEED_LIMIT] = np.nan if lane.speed_limit is None else lane.speed_limit
-    if type(lane) is CircularLane:
-        row[L_KIND] = CIRCULAR
-        row[[L_X, L_Y]] = lane.center
-        row[L_RADIUS], row[L_START_PHASE], row[L_TURN] = lane.radius, lane.start_phase, lane.direction
-        return row
-    if type(lane) not in (StraightLane, SineLane):
-        raise TypeError(f"no fast geometry for lanes of type {type(lane).__name__}")
-    row[[L_X, L_Y]], row[[L_DX, L_DY]], row[L_HEADING] = lane.start, lane.direction, lane.heading
-    if type(lane) is SineLane:
-        row[L_KIND] = SINE
-        row[L_AMPLITUDE], row[L_PULSATION], row[L_PHASE] = lane.amplitude, lane.pulsation, lane.phase
-    return row
-
-
-def _connections(
-    network: RoadNetwork, row_of: dict[LaneIndex, int], index: LaneIndex, connected_lanes: bool
-) -> list[tuple[int, float]]:
-    """Lanes (row, offset m) that highway-env's `neighbour_vehicles` searches for `index`, in its order."""
-    start, end, lane_id = index
-    found = [(row_of[index], 0.0)]
-    if not connected_lanes:
-        return found
-    own_length = float(network.get_lane(index).length)
-    for after, lanes in network.graph.get(end, {}).items():
-        found.append((row_of[end, after, lane_id if lane_id < len(lanes) else 0], own_length))
-    for before, roads in network.graph.items():
-        if start in roads:
-            chosen = (before, start, lane_id if lane_id < len(roads[start]) else 0)
-            found.append((row_of[chosen], -float(network.get_lane(chosen).length)))
-    return found
-
-
-class FastNetwork(RoadNetwork):
-    """highway-env's road network with a compiled closest-lane search."""
-
-    def __init__(self, network: RoadNetwork, connected_lanes: bool = False) -> None:
-        super().__init__()
-        self.graph = network.graph
-        self.connected_lanes = connected_lanes
-        self.table = LaneTable(network, connected_lanes)
-
-    def get_closest_lane_index(self, position: Array, heading: float | None = None) -> LaneIndex:
-        row = closest_lane(self.table.rows, position[0], position[1], math.nan if heading is None else heading)
-        return self.table.indices[row]
 
 
 class FastRoad(RegulatedRoad):
@@ -423,42 +258,8 @@ def route_table(vehicles: list[TrafficVehicle], lanes: LaneTable) -> Ints:
     return table
 
 
-# --- highway-env's own, for comparison -----------------------------------------------------------------------------
-
-
 def make_road(road_map: RoadMap, rng: np.random.Generator, network: FastNetwork) -> FastRoad:
     """An empty fast road of this map, with highway-env's own obstacles on it."""
     road = FastRoad(network, rng, road_map.regulated)
     road.objects = [Obstacle(road, position) for position in road_map.obstacles]
     return road
-
-
-def stock_twin(road: FastRoad) -> Road:
-    """highway-env's own `Road` or `RegulatedRoad`, lanes and vehicle code, in the same state.
-
-    Connected vehicles become ones that hold their present action.
-    """
-    network = RoadNetwork()
-    network.graph = road.network.graph
-    kind = RegulatedRoad if road.regulated else Road
-    twin = kind(
-        network=network,
-        np_random=np.random.default_rng(0),
-        neighbour_vehicles_connected_lanes=road.neighbour_vehicles_connected_lanes,
-    )
-    twin.objects = [_twin_body(o, twin) for o in road.objects]
-    twin.vehicles = [_twin_body(v, twin) for v in road.vehicles]
-    if road.regulated:
-        twin.steps = road.steps
-    return twin
-
-
-def _twin_body(body: Any, road: Road) -> Any:
-    twin = body.__class__.__new__(body.__class__)
-    twin.__dict__.update(body.__dict__)
-    twin.road, twin.position = road, body.position.copy()
-    if isinstance(body, Vehicle):
-        twin.action = dict(body.action)
-        twin.route = None if body.route is None else list(body.route)
-        twin.impact = None if body.impact is None else np.array(body.impact)
-    return twin

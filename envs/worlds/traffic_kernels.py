@@ -1,7 +1,8 @@
 """The arithmetic of highway-env's traffic over tables of lanes and vehicles: kernels, and NumPy where bits matter.
 
-Each function names the one of highway-env that it stands for. A lane table has the columns L_*, a table of vehicles and
-obstacles V_*, what drivers see S_*. Everything is in highway-env's frame (x right, y down on its screen).
+Drivers, motion and the right of way; `lane_kernels` has the geometry and the columns L_* and V_* of the tables,
+`collision_kernels` what follows when vehicles meet. Each function names the one of highway-env that it stands for, and
+all are in its frame (x right, y down on its screen).
 """
 
 from __future__ import annotations
@@ -14,140 +15,56 @@ from numba import njit
 from numpy.typing import NDArray
 
 from .driving_maps import MAPS  # noqa: F401 - first: it says what to install when highway-env is missing
+from .lane_kernels import (
+    L_HEADING,
+    L_KIND,
+    L_LENGTH,
+    L_SPEED_LIMIT,
+    L_WIDTH,
+    SINE,
+    V_ACC_MAX,
+    V_ACCELERATION,
+    V_COMFORT_MAX,
+    V_COMFORT_MIN,
+    V_COS,
+    V_CRASHED,
+    V_DELTA,
+    V_DISTANCE,
+    V_HEADING,
+    V_IMPACT_X,
+    V_IMPACT_Y,
+    V_LANE,
+    V_LENGTH,
+    V_SIN,
+    V_SPEED,
+    V_STEERING,
+    V_TARGET,
+    V_TARGET_SPEED,
+    V_TIME,
+    V_WIDTH,
+    V_X,
+    V_Y,
+    VEHICLE_END_M,
+    heading_at,
+    local_coordinates,
+    position_at,
+    projected,
+    slope_at,
+)
 
 # isort: split
-from highway_env.road.lane import AbstractLane
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.kinematics import Vehicle
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-STRAIGHT, SINE, CIRCULAR = 0, 1, 2
-# Columns of the lane table.
-L_KIND, L_X, L_Y, L_DX, L_DY, L_LENGTH, L_WIDTH, L_HEADING, L_AMPLITUDE, L_PULSATION, L_PHASE = range(11)
-L_RADIUS, L_START_PHASE, L_TURN, L_SPEED_LIMIT, LANE_COLUMNS = range(11, 16)
-# Columns of the vehicle table.
-V_X, V_Y, V_HEADING, V_SPEED, V_LANE, V_TARGET, V_TARGET_SPEED, V_DELTA, V_LENGTH, V_WIDTH = range(10)
-V_ACC_MAX, V_COMFORT_MAX, V_COMFORT_MIN, V_DISTANCE, V_TIME, V_CRASHED, V_STEERING, V_ACCELERATION = range(10, 18)
-V_IMPACT_X, V_IMPACT_Y, V_IMPACTED, V_COS, V_SIN, VEHICLE_COLUMNS = range(18, 24)
 # Columns of the situation table: what an IDM driver needs to know.
 S_WANTED, S_GAP, S_TARGET_GAP, S_LATERAL, S_HEADING, S_SLOPE, SITUATION_COLUMNS = range(7)
 
 LOOK_AHEAD_S = np.arange(0.25, 3, 0.25)  # RegulatedRoad.is_conflict_possible: horizon 3 s, step 0.25 s
 MAX_STEERING_RAD = IDMVehicle.MAX_STEERING_ANGLE
-VEHICLE_END_M = AbstractLane.VEHICLE_LENGTH
 PURSUIT_S = IDMVehicle.TAU_PURSUIT
-
-
-# --- lane geometry -------------------------------------------------------------------------------------------------
-
-
-@njit(cache=True)
-def wrap_to_pi(x: float) -> float:
-    """highway_env.utils.wrap_to_pi."""
-    return ((x + math.pi) % (2 * math.pi)) - math.pi
-
-
-@njit(cache=True)
-def not_zero(x: float) -> float:
-    """highway_env.utils.not_zero."""
-    if abs(x) > 1e-2:
-        return x
-    return 1e-2 if x >= 0 else -1e-2
-
-
-@njit(cache=True)
-def local_coordinates(lane: Array, x: float, y: float, angle: float) -> tuple[float, float]:
-    """(longitudinal, lateral) m of a point on a lane: `AbstractLane.local_coordinates`.
-
-    `angle` is the point's direction (rad) from the lane's centre, used by circular lanes only.
-    """
-    dx, dy = x - lane[L_X], y - lane[L_Y]
-    if lane[L_KIND] == CIRCULAR:
-        phi = lane[L_START_PHASE] + wrap_to_pi(angle - lane[L_START_PHASE])
-        longitudinal = lane[L_TURN] * (phi - lane[L_START_PHASE]) * lane[L_RADIUS]
-        return longitudinal, lane[L_TURN] * (lane[L_RADIUS] - math.sqrt(dx * dx + dy * dy))
-    longitudinal = dx * lane[L_DX] + dy * lane[L_DY]
-    lateral = dy * lane[L_DX] - dx * lane[L_DY]
-    if lane[L_KIND] == SINE:
-        lateral -= lane[L_AMPLITUDE] * math.sin(lane[L_PULSATION] * longitudinal + lane[L_PHASE])
-    return longitudinal, lateral
-
-
-@njit(cache=True)
-def projected(lane: Array, x: float, y: float) -> tuple[float, float]:
-    """`local_coordinates` with the compiler's own arctangent: right to the last bit or two."""
-    angle = math.atan2(y - lane[L_Y], x - lane[L_X]) if lane[L_KIND] == CIRCULAR else 0.0
-    return local_coordinates(lane, x, y, angle)
-
-
-@njit(cache=True)
-def slope_at(lane: Array, longitudinal: float) -> float:
-    """Tangent of a sine lane's deviation from its axis."""
-    return lane[L_AMPLITUDE] * lane[L_PULSATION] * math.cos(lane[L_PULSATION] * longitudinal + lane[L_PHASE])
-
-
-@njit(cache=True)
-def heading_at(lane: Array, longitudinal: float) -> float:
-    """Heading (rad) of a lane: `AbstractLane.heading_at`."""
-    if lane[L_KIND] == CIRCULAR:
-        phi = lane[L_TURN] * longitudinal / lane[L_RADIUS] + lane[L_START_PHASE]
-        return phi + math.pi / 2 * lane[L_TURN]
-    if lane[L_KIND] == SINE:
-        return lane[L_HEADING] + math.atan(slope_at(lane, longitudinal))
-    return lane[L_HEADING]
-
-
-@njit(cache=True)
-def position_at(lane: Array, longitudinal: float) -> tuple[float, float]:
-    """Point (m) of a lane's centre line: `AbstractLane.position(longitudinal, 0)`."""
-    if lane[L_KIND] == CIRCULAR:
-        phi = lane[L_TURN] * longitudinal / lane[L_RADIUS] + lane[L_START_PHASE]
-        return lane[L_X] + lane[L_RADIUS] * math.cos(phi), lane[L_Y] + lane[L_RADIUS] * math.sin(phi)
-    lateral = 0.0
-    if lane[L_KIND] == SINE:
-        lateral = lane[L_AMPLITUDE] * math.sin(lane[L_PULSATION] * longitudinal + lane[L_PHASE])
-    x = lane[L_X] + longitudinal * lane[L_DX] - lateral * lane[L_DY]
-    y = lane[L_Y] + longitudinal * lane[L_DY] + lateral * lane[L_DX]
-    return x, y
-
-
-@njit(cache=True)
-def closest_lane(lanes: Array, x: float, y: float, heading: float) -> int:
-    """Row of the closest lane in position and heading (nan: position alone): `RoadNetwork.get_closest_lane_index`."""
-    best, best_distance = 0, np.inf
-    for row in range(len(lanes)):
-        lane = lanes[row]
-        s, lateral = projected(lane, x, y)
-        distance = abs(lateral) + max(s - lane[L_LENGTH], 0.0) + max(0.0 - s, 0.0)
-        if not math.isnan(heading):
-            if distance >= best_distance:
-                continue
-            distance += abs(wrap_to_pi(heading - heading_at(lane, s)))
-        if distance < best_distance:
-            best, best_distance = row, distance
-    return best
-
-
-@njit(cache=True)
-def closest_lanes(lanes: Array, vehicles: Array) -> Ints:
-    """Row (n,) of each vehicle's closest lane."""
-    rows = np.zeros(len(vehicles), dtype=np.int64)
-    for k in range(len(vehicles)):
-        rows[k] = closest_lane(lanes, vehicles[k, V_X], vehicles[k, V_Y], vehicles[k, V_HEADING])
-    return rows
-
-
-@njit(cache=True)
-def past_end(lanes: Array, vehicles: Array, angles: Array) -> NDArray[np.bool_]:
-    """(n,) whether each vehicle has passed the end of its target lane: `AbstractLane.after_end`."""
-    ended = np.zeros(len(vehicles), dtype=np.bool_)
-    for k in range(len(vehicles)):
-        row = int(vehicles[k, V_TARGET])
-        s, _ = local_coordinates(lanes[row], vehicles[k, V_X], vehicles[k, V_Y], angles[k, row])
-        ended[k] = s > lanes[row, L_LENGTH] - VEHICLE_END_M / 2
-    return ended
 
 
 # --- drivers -------------------------------------------------------------------------------------------------------
@@ -178,6 +95,14 @@ def neighbours(
                 rear, s_rear = k, s_k
             break
     return front, rear
+
+
+@njit(cache=True)
+def not_zero(x: float) -> float:
+    """highway_env.utils.not_zero."""
+    if abs(x) > 1e-2:
+        return x
+    return 1e-2 if x >= 0 else -1e-2
 
 
 @njit(cache=True)
@@ -275,141 +200,6 @@ def move(vehicles: Array, dt: float) -> None:
     vehicles[:, V_HEADING] += speed * np.sin(beta) / (vehicles[:, V_LENGTH] / 2) * dt
     vehicles[:, V_SPEED] += acceleration * dt
     vehicles[:, V_STEERING], vehicles[:, V_ACCELERATION] = steering, acceleration
-
-
-# --- collisions ----------------------------------------------------------------------------------------------------
-
-
-@njit(cache=True)
-def corners(x: float, y: float, heading: float, length: float, width: float) -> Array:
-    """(4, 2) m corners of a rectangle in order around it: `RoadObject.polygon` without its closing point."""
-    c, s = math.cos(heading), math.sin(heading)
-    out = np.empty((4, 2))
-    for k in range(4):
-        dx = -length / 2 if k < 2 else length / 2
-        dy = width / 2 if k == 1 or k == 2 else -width / 2
-        out[k, 0] = x + c * dx - s * dy
-        out[k, 1] = y + s * dx + c * dy
-    return out
-
-
-@njit(cache=True)
-def rectangles_intersect(a: Array, b: Array, ax: float, ay: float, bx: float, by: float) -> tuple[bool, bool]:
-    """Whether two rectangles (4, 2) intersect now, and after moving by (ax, ay) and (bx, by).
-
-    The yes or no of `utils.are_polygons_intersecting`.
-    """
-    intersecting, will_intersect = True, True
-    for polygon in (a, b):
-        for k in range(4):
-            nx = -(polygon[(k + 1) % 4, 1] - polygon[k, 1])
-            ny = polygon[(k + 1) % 4, 0] - polygon[k, 0]
-            norm = math.sqrt(nx * nx + ny * ny)
-            nx, ny = nx / norm, ny / norm
-            a_projected, b_projected = a[:, 0] * nx + a[:, 1] * ny, b[:, 0] * nx + b[:, 1] * ny
-            min_a, max_a = a_projected.min(), a_projected.max()
-            min_b, max_b = b_projected.min(), b_projected.max()
-            if (min_b - max_a if min_a < min_b else min_a - max_b) > 0:
-                intersecting = False
-            moved = nx * (ax - bx) + ny * (ay - by)
-            if moved < 0:
-                min_a += moved
-            else:
-                max_a += moved
-            if (min_b - max_a if min_a < min_b else min_a - max_b) > 0:
-                will_intersect = False
-            if not intersecting and not will_intersect:
-                return False, False
-    return intersecting, will_intersect
-
-
-@njit(cache=True)
-def translation(a: Array, b: Array, moved_a: Array, moved_b: Array) -> Array:
-    """(2,) m by which highway-env moves colliding rectangles apart; a, b (5, 2) are its closed polygons.
-
-    The translation of `utils.are_polygons_intersecting`.
-    """
-    shortest, axis = np.inf, np.zeros(2)
-    toward_x, toward_y = a[:4, 0].mean() - b[:4, 0].mean(), a[:4, 1].mean() - b[:4, 1].mean()
-    for polygon in (a, b):
-        for k in range(4):
-            nx, ny = -polygon[k + 1, 1] + polygon[k, 1], polygon[k + 1, 0] - polygon[k, 0]
-            norm = math.sqrt(nx * nx + ny * ny)
-            nx, ny = nx / norm, ny / norm
-            a_projected, b_projected = a[:, 0] * nx + a[:, 1] * ny, b[:, 0] * nx + b[:, 1] * ny
-            min_a, max_a = a_projected.min(), a_projected.max()
-            min_b, max_b = b_projected.min(), b_projected.max()
-            moved = nx * (moved_a[0] - moved_b[0]) + ny * (moved_a[1] - moved_b[1])
-            if moved < 0:
-                min_a += moved
-            else:
-                max_a += moved
-            distance = min_b - max_a if min_a < min_b else min_a - max_b
-            if abs(distance) < shortest:
-                shortest = abs(distance)
-                sign = 1.0 if toward_x * nx + toward_y * ny > 0 else -1.0
-                axis[0], axis[1] = sign * nx, sign * ny
-    return shortest * axis
-
-
-@njit(cache=True)
-def diagonal(body: Array) -> float:
-    """Length (m) of a body's diagonal."""
-    return math.sqrt(body[V_LENGTH] ** 2 + body[V_WIDTH] ** 2)
-
-
-@njit(cache=True)
-def outline(body: Array) -> Array:
-    """(4, 2) m corners of a body."""
-    return corners(body[V_X], body[V_Y], body[V_HEADING], body[V_LENGTH], body[V_WIDTH])
-
-
-@njit(cache=True)
-def collisions(bodies: Array, n: int, dt: float) -> Ints:
-    """Pairs of bodies, the first of them one of the first n, that touch or will within `dt` s.
-
-    Rows [i, j, intersecting, will intersect], in the order of `Road.step`: for every vehicle the
-    later vehicles, then all obstacles.
-    """
-    found = [(0, 0, 0, 0)]
-    for i in range(n):
-        a = bodies[i]
-        for j in range(i + 1, len(bodies)):
-            b = bodies[j]
-            reach = (diagonal(a) + diagonal(b)) / 2 + a[V_SPEED] * dt
-            if math.sqrt((b[V_X] - a[V_X]) ** 2 + (b[V_Y] - a[V_Y]) ** 2) > reach:
-                continue
-            hits, will_hit = rectangles_intersect(
-                outline(a),
-                outline(b),
-                a[V_SPEED] * a[V_COS] * dt,
-                a[V_SPEED] * a[V_SIN] * dt,
-                b[V_SPEED] * b[V_COS] * dt,
-                b[V_SPEED] * b[V_SIN] * dt,
-            )
-            if hits or will_hit:
-                found.append((i, j, 1 if hits else 0, 1 if will_hit else 0))
-    out = np.empty((len(found) - 1, 4), dtype=np.int64)
-    for k in range(1, len(found)):
-        out[k - 1, 0], out[k - 1, 1], out[k - 1, 2], out[k - 1, 3] = found[k]
-    return out
-
-
-@njit(cache=True)
-def touching(cars: Array, bodies: Array) -> NDArray[np.bool_]:
-    """(n,) whether each rectangle of cars (n, 5) x, y, heading, length, width overlaps any of bodies (k, 5)."""
-    out = np.zeros(len(cars), dtype=np.bool_)
-    for i in range(len(cars)):
-        x, y, heading, length, width = cars[i]
-        for j in range(len(bodies)):
-            u, v, turn, long, wide = bodies[j]
-            if math.hypot(u - x, v - y) > (math.hypot(length, width) + math.hypot(long, wide)) / 2:
-                continue
-            now, _ = rectangles_intersect(
-                corners(x, y, heading, length, width), corners(u, v, turn, long, wide), 0.0, 0.0, 0.0, 0.0
-            )
-            out[i] |= now
-    return out
 
 
 # --- right of way --------------------------------------------------------------------------------------------------

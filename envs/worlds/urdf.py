@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-import struct
 from xml.etree import ElementTree
 
 import numpy as np
 
 from ..camera import shapes
 from ..camera.shapes import Color
+from ..camera.stock import load_mesh
 from .world import Array, Mesh
 
 GREY: Color = (160, 160, 160)
@@ -39,7 +39,7 @@ def urdf_mesh(path: str, *, detail_m: float = 0.0, colors: dict[str, Color] | No
                 continue
             material = visual.find("material")
             color = palette.get(material.attrib["name"], GREY) if material is not None else GREY
-            part = read_stl(os.path.join(os.path.dirname(path), source.attrib["filename"]), color)
+            part = load_mesh(os.path.join(os.path.dirname(path), source.attrib["filename"]), color)
             T = poses[link.attrib["name"]] @ _origin(visual.find("origin"))
             parts.append(Mesh(part.vertices @ T[:3, :3].T + T[:3, 3], part.faces, part.colors))
     if not parts:
@@ -47,21 +47,12 @@ def urdf_mesh(path: str, *, detail_m: float = 0.0, colors: dict[str, Color] | No
     return shapes.merge(*(simplified(part, detail_m) for part in parts))
 
 
-def read_stl(path: str, color: Color = GREY) -> Mesh:
-    """A binary STL file in one colour. Raises ValueError for anything else."""
-    with open(path, "rb") as f:
-        data = f.read()
-    count = struct.unpack("<I", data[80:84])[0] if len(data) >= 84 else -1
-    if len(data) != 84 + 50 * count:
-        raise ValueError(f"{path} is not a binary STL file")
-    rows = np.frombuffer(data, dtype=np.dtype("<12f4,<u2"), count=count, offset=84)
-    corners = rows["f0"].reshape(-1, 4, 3)[:, 1:].reshape(-1, 3).astype(np.float64)
-    vertices, index = np.unique(corners, axis=0, return_inverse=True)
-    return shapes.mesh(vertices, index.reshape(-1, 3), color)
-
-
 def simplified(body: Mesh, detail_m: float) -> Mesh:
-    """The mesh with all vertices in a cube of edge `detail_m` drawn together to their mean, without collapsed faces."""
+    """The mesh with all vertices in a cube of edge `detail_m` drawn together to their mean, without collapsed faces.
+
+    Unlike those of `camera.stock.simplify` the cubes lie on the grid of the body frame, whatever the mesh; v0's pictures
+    of stock robots depend on it.
+    """
     if detail_m <= 0:
         return body
     cells = np.floor(body.vertices / detail_m).astype(np.int64)
@@ -82,7 +73,7 @@ def simplified(body: Mesh, detail_m: float) -> Mesh:
 
 def _link_poses(root: ElementTree.Element) -> dict[str, Array]:
     """T_root_link (4, 4) of every link."""
-    joints = {j.find("child").attrib["link"]: j for j in root.iter("joint") if j.find("child") is not None}  # type: ignore[union-attr]
+    joints = {child.attrib["link"]: j for j in root.iter("joint") if (child := j.find("child")) is not None}
     poses: dict[str, Array] = {}
 
     def pose(link: str) -> Array:

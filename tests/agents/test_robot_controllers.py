@@ -11,7 +11,8 @@ from covis.agents.controllers.robots import Orbit, SeekView, Waypoints, bearing_
 from covis.envs.worlds import aerial_ground, multi_robot, target_localization
 from covis.envs.worlds.aerial_ground import AerialGroundParams, AerialGroundWorld
 from covis.envs.worlds.multi_robot import MultiRobotParams, MultiRobotWorld
-from covis.envs.worlds.robots import RobotWorld, camera_mount, planar_poses
+from covis.envs.worlds.robot_generation import camera_mount, planar_poses
+from covis.envs.worlds.robots import RobotWorld
 from covis.envs.worlds.target_localization import TargetLocalizationWorld
 
 EMPTY = {"n_team": 0, "n_obstacles": (0, 0), "n_backdrop": (0, 0)}

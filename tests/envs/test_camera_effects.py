@@ -199,7 +199,10 @@ def test_a_mount_takes_pictures_at_its_rate() -> None:
     assert all(Mount().is_due(step, 0.2) for step in range(5))
 
 
-@pytest.mark.parametrize("values", [{"horizontal_fov_rad": 4.0}, {"tilt_rad": 2.0}, {"rate_hz": 0.0}])
-def test_bad_mounts_say_what_is_wrong(values: dict[str, float]) -> None:
+@pytest.mark.parametrize(
+    "values",
+    [{"horizontal_fov_rad": 4.0}, {"tilt_rad": 2.0}, {"rate_hz": 0.0}, {"height_m": None}, {"pan_rad": np.nan}],
+)
+def test_bad_mounts_say_what_is_wrong(values: dict[str, float | None]) -> None:
     with pytest.raises(ValueError, match=next(iter(values))):
         Mount(**values)  # type: ignore[arg-type]

@@ -10,18 +10,15 @@ pytest.importorskip("highway_env")
 from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road, RoadNetwork
 
+from covis.envs.worlds.collision_kernels import collisions, translation
 from covis.envs.worlds.driving import ConnectedDrivingWorld, DrivingParams, _pedestrian_obstacle
 from covis.envs.worlds.driving_maps import MAPS, road_map
 from covis.envs.worlds.highway_peer import bare_intersection
-from covis.envs.worlds.traffic import ConnectedVehicle, FastNetwork, LaneTable, stock_twin, vehicle_table
-from covis.envs.worlds.traffic_kernels import (
-    closest_lane,
-    collisions,
-    heading_at,
-    position_at,
-    projected,
-    translation,
-)
+from covis.envs.worlds.lane_kernels import closest_lane, heading_at, position_at, projected
+from covis.envs.worlds.traffic import vehicle_table
+from covis.envs.worlds.traffic_lanes import FastNetwork, LaneTable
+from covis.envs.worlds.traffic_twin import stock_twin
+from covis.envs.worlds.traffic_vehicles import ConnectedVehicle
 
 STEPS = 100
 

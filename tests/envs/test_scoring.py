@@ -150,6 +150,35 @@ def test_loose_boxes_have_no_identity():
     assert score([claims, honest(t, 1, [])], t).tied[0, 0] == -1
 
 
+@pytest.mark.parametrize(("width", "tied"), [(20.1, -1), (20.0, 0), (19.9, 0)])
+def test_a_box_is_its_objects_from_an_overlap_of_one_half_on(width, tied):
+    box = np.array([[0.0, 0, width, 10]])
+    assert tie(box, np.array([[0.0, 0, 10, 10]]), np.array([100])).tolist() == [tied]
+
+
+def test_a_match_that_both_assert_has_the_higher_score():
+    t = truth()
+    a, b = honest(t, 0, [0, 1], {0: [0, 1]}), honest(t, 1, [0, 1], {0: [0, 1]})
+    a.match_scores[0, :2], b.match_scores[0, :2] = (0.3, 0.8), (0.6, 0.2)
+    (pair,) = score([a, b], t).pairs
+    assert dict(zip(map(tuple, pair.assertions.tolist()), pair.scores.tolist(), strict=True)) == {
+        (0, 0): 0.6,
+        (1, 1): 0.8,
+    }
+
+
+def test_visible_objects_are_those_large_enough_in_both_images():
+    t = truth(visible=np.array([[True, True, False, False], [True, False, True, False]]))
+    assert score([Claims.empty(K, 1), Claims.empty(K, 1)], t).n_visible == 1
+
+
+def test_an_object_counts_by_the_best_robot_that_claims_it_matched_or_not():
+    t = truth()
+    result = score([honest(t, 0, [0, 1], error=0.3), honest(t, 1, [1, 2], error=0.1)], t)
+    np.testing.assert_allclose(result.object_error, [0.3, 0.1, 0.1, np.inf])
+    assert LocalizationReward(cap_m=1.0)(result) == pytest.approx((0.7 + 0.9 + 0.9) / 4)
+
+
 def test_unmatched_objects_do_not_enter_the_displacement_error():
     t = truth()
     a = honest(t, 0, [0, 1], {0: [0]})
