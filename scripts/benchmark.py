@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import typer
-from rich.table import Table
 
 from ..evaluation.benchmark import benchmark as run_benchmark
 from ..evaluation.benchmark import benchmark_suite
@@ -18,6 +16,7 @@ from ..evaluation.methods import Method
 from ..evaluation.settings import Settings
 from ..evaluation.suites import SUITES
 from .console import complain, err, fail, out, progress_bar, require_writable, require_writable_figure, write_rows
+from .tables import Column, number, print_rows, share, short, words
 
 
 def benchmark(
@@ -80,9 +79,8 @@ def benchmark(
 
         save(benchmark_figure(rows), figure)
     if json_target != "-":
-        out.print(table(rows))
-        if verdicts:
-            out.print(verdict_table(verdicts))
+        print_benchmark(rows)
+        print_verdicts(verdicts)
     if any(row["n_failed"] for row in rows):
         for row in rows:
             if row["n_failed"]:
@@ -163,19 +161,8 @@ def _perception(
         fail(error)
     write_rows(rows, json_target)
     if json_target != "-":
-        out.print(_figures(rows, table_columns()))
-        out.print(_figures([row for row in rows if "known_ap50" in row], shift_columns()))
-
-
-def _figures(rows: list[dict[str, Any]], columns: Sequence[tuple[str, str]]) -> Table:
-    """Rows as a table of these keys and titles."""
-    view = Table(header_style="bold")
-    for key, title in columns:
-        view.add_column(title, justify="left" if key == "target" else "right")
-    for row in rows:
-        cells = (row.get(key) for key, _ in columns)
-        view.add_row(*(c if isinstance(c, str) else "" if c is None else f"{c:.3f}" for c in cells))
-    return view
+        for part, columns in ((rows, table_columns()), ([r for r in rows if "known_ap50" in r], shift_columns())):
+            print_rows(part, [Column(t, words(k) if k == "target" else share(k), k == "target") for k, t in columns])
 
 
 def default_methods(settings: Settings) -> list[str]:
@@ -185,19 +172,15 @@ def default_methods(settings: Settings) -> list[str]:
     return [name for name in METHODS if settings.pose == "known" or name != "hungarian"]
 
 
-def table(rows: list[dict[str, Any]]) -> Table:
-    """The rows for a person: target, method and the figures that are there."""
-    caption = "to best: difference of F1 to the highest; ~ where noise alone may explain it (paired over episodes)"
-    compared = any(row.get("ties_best") is not None for row in rows)
-    rows = _told_apart(rows)
-    view = Table(title=None, header_style="bold", caption=caption if compared else None, caption_justify="left")
-    shown = [column for column in COLUMNS if any(column[2](row) for row in rows)]
-    for key, title, _ in shown:
-        view.add_column(title, justify="left" if key in ("target", "method") else "right", no_wrap=True)
-    for row, after in zip(rows, [*rows[1:], None], strict=True):
-        last = after is None or _target(after) != _target(row)
-        view.add_row(*(cell(row) for _, _, cell in shown), end_section=last)
-    return view
+def print_benchmark(rows: list[dict[str, Any]]) -> None:
+    """The rows for a person, a table per target: methods and the figures that are there."""
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for row in _told_apart(rows):
+        groups.setdefault(_target(row), []).append(row)
+    for target, own in groups.items():
+        print_rows(own, COLUMNS, f"{target}: {own[0]['pairs']} pairs of views, {own[0]['episodes']} episodes")
+    if any(row.get("ties_best") is not None for row in rows):
+        out.print("to best: difference of F1 to the highest; ~ where noise alone may explain it (paired over episodes)")
 
 
 def _told_apart(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -208,14 +191,18 @@ def _told_apart(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return [row | {"target": row["experiment"]} if len(folders[row["target"]]) > 1 else row for row in rows]
 
 
-def verdict_table(verdicts: list[dict[str, Any]]) -> Table:
-    """What the data say of orderings, with the pair that fits the least."""
-    view = Table("experiment", "who says what of F1", "verdict", "least difference", header_style="bold")
-    for verdict in verdicts:
-        least = min(verdict["pairs"], key=lambda pair: pair["difference"], default=None)
-        shown = "" if least is None else f"{least['difference']:+.3f} {least['higher']} to {least['lower']}"
-        view.add_row(verdict["experiment"], verdict["says"], verdict["verdict"], shown)
-    return view
+def print_verdicts(verdicts: list[dict[str, Any]]) -> None:
+    """What the data say of orderings, a table per experiment."""
+    for experiment in dict.fromkeys(verdict["experiment"] for verdict in verdicts):
+        own = [_verdict(verdict) for verdict in verdicts if verdict["experiment"] == experiment]
+        print_rows(own, VERDICT_COLUMNS, str(experiment))
+
+
+def _verdict(verdict: dict[str, Any]) -> dict[str, Any]:
+    """What the data say of an ordering, with the pair that fits the least."""
+    least = min(verdict["pairs"], key=lambda pair: pair["difference"], default=None)
+    shown = None if least is None else f"{short(least['difference'], '{:+.3f}')} {least['higher']} to {least['lower']}"
+    return verdict | {"least": shown}
 
 
 def _target(row: dict[str, Any]) -> str:
@@ -235,24 +222,35 @@ def _to_best(row: dict[str, Any]) -> str:
         return ""
     if difference == 0.0 and row["ties_best"]:
         return "best"
-    return f"{'~ ' if row['ties_best'] else ''}{difference:+.3f}"
+    return f"{'~ ' if row['ties_best'] else ''}{short(difference, '{:+.3f}')}"
 
 
-def _number(key: str, form: str = "{:.3f}") -> Callable[[dict[str, Any]], str]:
-    return lambda row: "" if row.get(key) is None else form.format(row[key])
+def _interval(row: dict[str, Any]) -> str:
+    if row["episodes"] < 2:
+        return ""
+    return "-".join(short(row[key]).replace("1.000", "1") for key in ("f1_low", "f1_high"))
 
 
-COLUMNS: tuple[tuple[str, str, Callable[[dict[str, Any]], str]], ...] = (
-    ("target", "target", _target),
-    ("method", "method", _method),
-    ("pairs", "pairs", lambda row: str(row["pairs"])),
-    ("precision", "precision", _number("precision")),
-    ("recall", "recall", _number("recall")),
-    ("f1", "F1", _number("f1")),
-    ("f1_low", "95 %", lambda row: f"{row['f1_low']:.3f}-{row['f1_high']:.3f}" if row["episodes"] > 1 else "1 episode"),
-    ("f1_minus_best", "to best", _to_best),
-    ("ece", "ECE", _number("ece")),
-    ("displacement_single_m", "single m", _number("displacement_single_m")),
-    ("displacement_fused_m", "fused m", _number("displacement_fused_m")),
-    ("match_ms", "ms", _number("match_ms", "{:.2f}")),
+def _milliseconds(row: dict[str, Any]) -> str:
+    """Three digits, where there are as many."""
+    ms = row["match_ms"]
+    return "" if ms is None else f"{ms:.2f}" if ms < 9.995 else f"{ms:.1f}" if ms < 99.95 else f"{ms:.0f}"
+
+
+COLUMNS = (
+    Column("method", _method, label=True),
+    Column("prec.", share("precision")),
+    Column("recall", share("recall")),
+    Column("F1", share("f1")),
+    Column("95 %", _interval),
+    Column("to best", _to_best),
+    Column("ECE", share("ece")),
+    Column("alone\nm", number("displacement_single_m")),
+    Column("fused\nm", number("displacement_fused_m")),
+    Column("ms a\npair", _milliseconds),
+)
+VERDICT_COLUMNS = (
+    Column("who says what of F1", words("says"), label=True),
+    Column("verdict", words("verdict")),
+    Column("least difference", words("least")),
 )

@@ -60,14 +60,19 @@ def require_writable_figure(file: Path) -> None:
 
 
 def write_rows(rows: Sequence[dict[str, Any]], json_target: str | None) -> None:
-    """`{"rows": [...]}` to a file, or to standard output for `-`."""
+    """`{"rows": [...]}` to a file, or to standard output for `-`; nowhere for None."""
+    write_json({"rows": list(rows)}, json_target)
+
+
+def write_json(content: dict[str, Any], json_target: str | None) -> None:
+    """JSON to a file, or to standard output for `-`; nowhere for None."""
     if json_target is None:
         return
-    text = json.dumps({"rows": list(rows)}, indent=1, allow_nan=False)
+    text = json.dumps(content, indent=1, allow_nan=False) + "\n"
     if json_target == "-":
-        sys.stdout.write(text + "\n")
+        sys.stdout.write(text)
     else:
-        Path(json_target).write_text(text + "\n", encoding="utf-8")
+        Path(json_target).write_text(text, encoding="utf-8")
 
 
 def _escape(text: str) -> str:

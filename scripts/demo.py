@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from ..evaluation.demo import demo as run_demo
-from .benchmark import table
+from .benchmark import print_benchmark
 from .console import fail, out, progress_bar
 
 
@@ -18,9 +18,10 @@ def demo(
 ) -> None:
     """Scenes x methods, from pixels to displacement error: a table here, a report with pictures in a folder."""
     try:
+        folder.mkdir(parents=True, exist_ok=True)
         with progress_bar("demo") as progress:
             rows = run_demo(folder, seed, progress)
     except (ValueError, RuntimeError, OSError) as error:
         fail(error)
-    out.print(table(rows))
-    out.print(f"Report with pictures: {folder / 'report.md'}")
+    print_benchmark(rows)
+    out.print(f"Report with pictures: {folder / 'report.md'}", soft_wrap=True)

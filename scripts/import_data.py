@@ -22,6 +22,6 @@ def mrclam(
     """UTIAS MRCLAM: five robots, fifteen landmarks, range and bearing, odometry, motion capture."""
     try:
         imported = import_mrclam(source, target, window=window)
-    except (FileExistsError, ValueError) as error:
+    except (ValueError, OSError) as error:
         fail(error)
     out.print(f"{target}: {imported.frames} frames, {imported.robots} robots, {imported.detections} detections")

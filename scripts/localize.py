@@ -6,46 +6,53 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
 from ..evaluation.extras import require
 from ..evaluation.figures import save, team_figure
-from .console import fail, out, progress_bar, write_rows
+from .console import fail, progress_bar, require_writable, require_writable_figure, write_rows
+from .tables import Column, number, print_rows, share, words
 
 COLUMNS = {
     "scenes": (
-        "target",
-        "estimator",
-        "objects",
-        "precision",
-        "recall",
-        "n",
-        "single_m",
-        "fused_m",
-        "ratio",
-        "fused_median_m",
-        "fused_p95_m",
-        "nees_per_dof",
-        "alone_n",
-        "alone_fused_m",
-        "alone_nees_per_dof",
-        "gospa_m",
-        "identity_switches",
+        Column("estimator", words("estimator"), label=True),
+        Column("prec.", share("precision")),
+        Column("recall", share("recall")),
+        Column("n", words("n")),
+        Column("alone\nm", number("single_m")),
+        Column("fused\nm", number("fused_m")),
+        Column("ratio", number("ratio")),
+        Column("median\nm", number("fused_median_m")),
+        Column("95 %\nm", number("fused_p95_m")),
+        Column("NEES\na dof", number("nees_per_dof", "{:.2f}")),
+        Column("unmatched\nn", words("alone_n")),
+        Column("unmatched\nm", number("alone_fused_m")),
+        Column("unmatched\nNEES a dof", number("alone_nees_per_dof", "{:.2f}")),
+        Column("GOSPA\nm", number("gospa_m")),
+        Column("track\nswitches", words("identity_switches")),
     ),
-    "faults": ("fault", "matches", "protections", "precision", "f1", "fused_m", "growth", "nees_per_dof"),
+    "faults": (
+        Column("fault", words("fault"), label=True),
+        Column("matches", words("matches"), label=True),
+        Column("prec.", share("precision")),
+        Column("F1", share("f1")),
+        Column("fused\nm", number("fused_m")),
+        Column("growth", number("growth", "{:+.1%}")),
+        Column("NEES\na dof", number("nees_per_dof", "{:.2f}")),
+    ),
     "team": (
-        "what",
-        "robots",
-        "fused_m",
-        "fused_median_m",
-        "fused_p95_m",
-        "nees_per_dof",
-        "pairwise_f1",
-        "f1",
-        "convex_f1",
-        "spectral_f1",
+        Column("robots", words("robots"), label=True),
+        Column("fused\nm", number("fused_m")),
+        Column("median\nm", number("fused_median_m")),
+        Column("95 %\nm", number("fused_p95_m")),
+        Column("NEES\na dof", number("nees_per_dof", "{:.2f}")),
+        Column("F1\npairwise", share("pairwise_f1")),
+        Column("F1\njoint", share("f1")),
+        Column("F1\nconvex", share("convex_f1")),
+        Column("F1\nspectral", share("spectral_f1")),
     ),
 }
+TITLES = {"scenes": "{target}, {objects}", "faults": "faults, {protections} protections", "team": "team, {what}"}
+"""Of the tables of a part, one for each title that its rows give."""
 
 
 def localize(
@@ -61,8 +68,12 @@ def localize(
     """Displacement error, consistency and resilience of teams that match, fuse and track with noisy poses."""
     try:
         require("envs")
+        require_writable(json_target)
         if figure is not None:
             require("viz")
+            require_writable_figure(figure)
+            if parts and "team" not in parts:
+                raise ValueError(f"--figure draws the part team, got {' '.join(parts)}")
         from ..evaluation.localization import MIN_SCORE, PARTS, localization_rows
 
         with progress_bar("localize") as progress:
@@ -75,26 +86,19 @@ def localize(
                 exact_poses=exact_poses,
                 progress=progress,
             )
-    except (ValueError, RuntimeError) as error:
+    except (ValueError, RuntimeError, OSError) as error:
         fail(error)
     write_rows(rows, json_target)
     if figure is not None:
         save(team_figure(rows), figure)
     if json_target != "-":
-        for part in dict.fromkeys(row["part"] for row in rows):
-            out.print(table([row for row in rows if row["part"] == part], COLUMNS[part]))
+        print_parts(rows)
 
 
-def table(rows: list[dict[str, Any]], columns: tuple[str, ...]) -> Table:
-    """The rows for a person; a change of the first column draws a line."""
-    view = Table(header_style="bold")
-    for name in columns:
-        text = isinstance(rows[0].get(name), str)
-        view.add_column(name.replace("_", " "), justify="left" if text else "right")
-    for row, following in zip(rows, [*rows[1:], None], strict=True):
-        cells = [row.get(name) for name in columns]
-        last = following is None or following[columns[0]] != row[columns[0]]
-        view.add_row(
-            *("" if c is None else f"{c:.3f}" if isinstance(c, float) else str(c) for c in cells), end_section=last
-        )
-    return view
+def print_parts(rows: list[dict[str, Any]]) -> None:
+    """The rows for a person."""
+    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault((row["part"], TITLES[row["part"]].format_map(row)), []).append(row)
+    for (part, title), own in groups.items():
+        print_rows(own, COLUMNS[part], title)

@@ -11,7 +11,7 @@ from ..evaluation.extras import require
 from ..evaluation.figures import save, sensitivity_figure
 from ..evaluation.sensitivity import sensitivity as run_sensitivity
 from ..evaluation.tuning import mean_over_targets
-from .console import fail, out, progress_bar, write_rows
+from .console import fail, out, progress_bar, require_writable, require_writable_figure, write_rows
 
 
 def sensitivity(
@@ -25,11 +25,13 @@ def sensitivity(
 ) -> None:
     """F1 of rgm over lambda_1 and lambda_2, the analysis by which the paper chose 0.1 and 0.4."""
     try:
+        require_writable(json_target)
         if figure is not None:
             require("viz")
+            require_writable_figure(figure)
         with progress_bar("sensitivity") as progress:
             rows = run_sensitivity(targets, frames=frames, seed=seed, progress=progress)
-    except (ValueError, RuntimeError) as error:
+    except (ValueError, RuntimeError, OSError) as error:
         fail(error)
     write_rows(rows, json_target)
     several = len({row["target"] for row in rows}) > 1

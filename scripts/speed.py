@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
 from ..evaluation.extras import require
 from ..evaluation.figures import save, scaling_figure
 from ..evaluation.memory_matching import add_memory
-from .console import fail, out, progress_bar, write_rows
+from .console import fail, out, progress_bar, require_writable, require_writable_figure, write_rows
+from .tables import Column, print_rows, words
 
 AREAS = {
     "matching": ("speed_matching", None),
@@ -63,34 +63,41 @@ def speed(
                 measure = partial(measure, resets=resets, steps=steps, **({"scenes": scene} if scene else {}))
         else:
             measure = import_module(f"covis.evaluation.{module}").rows
+        require_writable(json_target)
         if figure is not None:
             require("viz")
+            require_writable_figure(figure)
         with progress_bar(f"speed {area}") as progress:
             rows = measure(progress)
         if figure is not None:
             rows = add_memory(rows)
             save(scaling_figure(rows), figure)
-    except (ValueError, RuntimeError) as error:
+    except (ValueError, RuntimeError, OSError) as error:
         fail(error)
     write_rows(rows, json_target)
     if json_target != "-":
-        out.print(table(rows))
+        print_speed(rows)
 
 
-def table(rows: list[dict[str, Any]]) -> Table:
-    view = Table(header_style="bold")
-    for title in ("what", "n", "ours", "peer's", "ratio", "peer"):
-        view.add_column(title, justify="left" if title in ("what", "peer") else "right", no_wrap=title != "peer")
-    for r in rows:
-        view.add_row(
-            r["what"],
-            "" if r["n"] is None else str(r["n"]),
-            _quantity(r["ours"], r["unit"]),
-            "" if r["peer_value"] is None else _quantity(r["peer_value"], r["unit"]),
-            "" if r["ratio"] is None else f"{r['ratio']:.1f}x" if r["unit"] == "1/s" else f"{r['ratio'] - 1:+.2%}",
-            r["peer"] or "",
-        )
-    return view
+COLUMNS = (
+    Column("what", words("what"), label=True),
+    Column("n", words("n")),
+    Column("ours", lambda row: _quantity(row["ours"], row["unit"])),
+    Column("peer's", lambda row: "" if row["peer_value"] is None else _quantity(row["peer_value"], row["unit"])),
+    Column("ratio", lambda row: _ratio(row["ratio"], row["unit"])),
+)
+
+
+def print_speed(rows: list[dict[str, Any]]) -> None:
+    """The rows for a person, and below them who the peers are."""
+    print_rows(rows, COLUMNS)
+    for peer in dict.fromkeys(row["peer"] for row in rows if row["peer"]):
+        against = ", ".join(dict.fromkeys(row["what"] for row in rows if row["peer"] == peer))
+        out.print(f"peer of {against}: {peer}", highlight=False, soft_wrap=True)
+
+
+def _ratio(ratio: float | None, unit: str) -> str:
+    return "" if ratio is None else f"{ratio:.1f}x" if unit == "1/s" else f"{ratio - 1:+.2%}"
 
 
 def _quantity(value: float, unit: str) -> str:

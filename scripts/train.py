@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
 from ..evaluation.extras import require
-from .console import err, fail, progress_bar, require_writable
+from .console import err, fail, progress_bar, require_writable, write_json
 from .console import out as console
+from .tables import Column, number, print_rows, share, words
 
 app = typer.Typer(help="Train what learns: perception, policies, calibration.", no_args_is_help=True)
 
@@ -66,7 +65,7 @@ def perception(
             report=_print,
         )
         finish(state, params, out, calibration_images)
-    except (ValueError, RuntimeError, FileExistsError) as error:
+    except (ValueError, RuntimeError, OSError) as error:
         fail(error)
     err.print(f"{out / 'eyes.safetensors'}: {state.step} steps, {state.images} images", soft_wrap=True)
 
@@ -102,16 +101,11 @@ def policy(
         if evaluation_episodes:
             with progress_bar("evaluation") as progress:
                 rows = evaluate_policy(params, load_policy(file), evaluation_episodes, progress)
-    except (ValueError, RuntimeError, FileExistsError) as error:
+    except (ValueError, RuntimeError, OSError) as error:
         fail(error)
     if rows:
-        (out / "evaluation.json").write_text(json.dumps({"rows": rows}, indent=1) + "\n", encoding="utf-8")
-        table = Table(header_style="bold")
-        for _, title, _ in COLUMNS:
-            table.add_column(title, justify="left" if title == "controller" else "right")
-        for row in rows:
-            table.add_row(*("" if row[key] is None else form.format(row[key]) for key, _, form in COLUMNS))
-        console.print(table)
+        write_json({"rows": rows}, str(out / "evaluation.json"))
+        print_rows(rows, [Column(title, number(key, form), key == "controller") for key, title, form in COLUMNS])
     err.print(f"{file}: trained", soft_wrap=True)
 
 
@@ -130,7 +124,9 @@ def calibration(
     ] = None,
     ridge: Annotated[float, typer.Option(help="Penalty on the weights, nats a pair: for few episodes, more.")] = 1e-4,
     seed: Annotated[int, typer.Option(help="Of shuffling, generated pairs and halves.")] = 0,
-    json_target: Annotated[str | None, typer.Option("--json", help="Write weights and rows to FILE.")] = None,
+    json_target: Annotated[
+        str | None, typer.Option("--json", help="Write weights, rows to FILE; - prints them.")
+    ] = None,
 ) -> None:
     """Fit how far `bayes` trusts its evidence to pairs of views, and measure it on halves of them.
 
@@ -157,21 +153,13 @@ def calibration(
         name: value if isinstance(value, float) else value.round(3).tolist()
         for name, value in found.fitted._asdict().items()
     }
-    if json_target is not None:
-        content = {
-            "kind": kind,
-            **fitted,
-            "weights": weights,
-            "ridge": ridge,
-            "seed": seed,
-            "bound": found.bound,
-            "rows": found.rows,
-        }
-        Path(json_target).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    console.print(_comparison(found.rows))
-    for name, value in fitted.items():
-        console.print(f"{name}: {value}", highlight=False)
-    console.print(f"ECE of some target after any monotone map of the held scores: at least {found.bound:.3f}")
+    content = {"kind": kind, **fitted, "weights": weights, "ridge": ridge, "seed": seed, "bound": found.bound}
+    write_json(content | {"rows": found.rows}, json_target)
+    if json_target != "-":
+        _print_comparison(found.rows)
+        for name, value in fitted.items():
+            console.print(f"{name}: {value}", highlight=False)
+        console.print(f"ECE of some target after any monotone map of the held scores: at least {found.bound:.3f}")
     if found.left_out:
         err.print(f"{found.left_out} pairs are of another kind and were left out")
 
@@ -189,17 +177,13 @@ def _weights(texts: list[str]) -> dict[str, float]:
     return weights
 
 
-def _comparison(rows: list[dict[str, Any]]) -> Table:
+def _print_comparison(rows: list[dict[str, Any]]) -> None:
     """F1 and ECE of every set under each calibration."""
-    table = Table(header_style="bold")
-    names = [name for name in ("whole", "held", "fitted", "halves") if f"{name}_f1" in rows[0]]
-    for title in ("target", "pairs", "emitted", *(f"F1 {n}" for n in names), *(f"ECE {n}" for n in names)):
-        table.add_column(title, justify="left" if title == "target" else "right")
-    for row in rows:
-        figures = [row[f"{name}_{key}"] for key in ("f1", "ece") for name in names]
-        shown = ("" if value is None else f"{value:.3f}" for value in figures)
-        table.add_row(row["target"], str(row["pairs"]), str(row["fitted_emitted"]), *shown)
-    return table
+    columns = [Column("target", words("target"), label=True), Column("pairs", words("pairs"))]
+    columns.append(Column("emitted", words("fitted_emitted")))
+    for key, title in (("f1", "F1"), ("ece", "ECE")):
+        columns += [Column(f"{title}\n{x}", share(f"{x}_{key}")) for x in ("whole", "held", "fitted", "halves")]
+    print_rows(rows, columns)
 
 
 def _print_iteration(row: dict[str, float]) -> None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
 from ..evaluation.tuning import GRIDS, compare_settings, mean_over_targets, setting_of
-from .console import fail, out, progress_bar, write_rows
+from .console import fail, progress_bar, require_writable, write_rows
+from .tables import Column, print_rows, share, words
 
 
 def tune(
@@ -22,23 +22,21 @@ def tune(
     if method not in GRIDS:
         fail(f"no grid is kept for {method!r}; there are {', '.join(GRIDS)}")
     try:
+        require_writable(json_target)
         with progress_bar(f"tune {method}") as progress:
             rows = compare_settings(targets, method, GRIDS[method], frames=frames, seed=seed, progress=progress)
-    except (ValueError, RuntimeError) as error:
+    except (ValueError, RuntimeError, OSError) as error:
         fail(error)
     write_rows(rows, json_target)
     if json_target != "-":
-        out.print(table(method, mean_over_targets(rows)))
+        print_settings(method, mean_over_targets(rows))
 
 
-def table(method: str, rows: list[dict[str, Any]]) -> Table:
+def print_settings(method: str, rows: list[dict[str, Any]]) -> None:
     """Settings, best first."""
-    view = Table(title=f"{method}, {rows[0]['target']}", header_style="bold")
-    for name in setting_of(rows[0]):
-        view.add_column(name)
-    for name in ("pairs", "precision", "recall", "F1"):
-        view.add_column(name, justify="right")
-    for row in sorted(rows, key=lambda row: -row["f1"]):
-        setting = [str(value) for value in setting_of(row).values()]
-        view.add_row(*setting, str(row["pairs"]), *(f"{row[name]:.3f}" for name in ("precision", "recall", "f1")))
-    return view
+    settings = [Column(name.replace("_", "\n"), words(name), label=True) for name in setting_of(rows[0])]
+    figures = [Column("pairs", words("pairs"))]
+    figures += [
+        Column(title, share(key)) for title, key in (("prec.", "precision"), ("recall", "recall"), ("F1", "f1"))
+    ]
+    print_rows(sorted(rows, key=lambda row: -row["f1"]), [*settings, *figures], f"{method}, {rows[0]['target']}")

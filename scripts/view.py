@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -28,7 +28,8 @@ def view(
 ) -> None:
     """Cameras, boxes, matches, objects with covariances, trajectories and figures over time, as a Rerun recording."""
     try:
-        settings = Settings(pose, preset, 0, sequence, seed, episodes, perception)  # type: ignore[arg-type]
+        given: dict[str, Any] = {"pose": pose, "preset": preset, "sequence": sequence, "seed": seed}
+        settings = Settings(**given, episodes=episodes, perception=perception)
         methods = [Method.parse(text) for text in method or ["bayes"]]
         with progress_bar("view") as progress:
             frames = write_view(target, file, methods, settings, progress)

@@ -36,6 +36,27 @@ def test_benchmark_prints_json(small_dataset):
     assert rows[0]["f1"] == 1.0
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["localize", "team", "--json", "nowhere/rows.json"], "there is no folder nowhere"),
+        (["localize", "scenes", "--figure", "error.png"], "--figure draws the part team, got scenes"),
+        (["localize", "team", "--figure", "error.gift"], "not as 'error.gift'"),
+        (["tune", "reid", ".", "--json", "nowhere/rows.json"], "there is no folder nowhere"),
+        (["sensitivity", ".", "--json", "nowhere/rows.json"], "there is no folder nowhere"),
+        (["sensitivity", ".", "--figure", "weights.gift"], "not as 'weights.gift'"),
+        (["speed", "matching", "--json", "nowhere/rows.json"], "there is no folder nowhere"),
+        (["speed", "matching", "--figure", "time.gift"], "not as 'time.gift'"),
+        (["demo", "--out", __file__], "File exists"),
+    ],
+)
+def test_what_cannot_be_written_is_found_out_before_the_work(arguments, message):
+    result = runner.invoke(app, arguments)
+    assert result.exit_code == 2, result.output
+    assert message in " ".join(result.output.split())
+    assert "Traceback" not in result.output
+
+
 def test_benchmark_writes_a_file_and_a_table(small_dataset, tmp_path):
     file = tmp_path / "rows.json"
     result = runner.invoke(app, ["benchmark", str(small_dataset), "--method", "reid", "--json", str(file)])
