@@ -12,6 +12,7 @@ from .engine import Results, make_executor, run
 from .experiments import Experiment, absolute, target_name, units_of
 from .extras import require_scene
 from .methods import Method
+from .progress import Progress, silent
 from .provenance import RENDERER, provenance
 from .records import Tally
 from .settings import SCENE_NAMES, Settings, scene_preset
@@ -97,7 +98,7 @@ def run_experiments(
     out: Path | None = None,
     resume: bool = False,
     overwrite: bool = False,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = silent,
     complain: Callable[[str], object] = lambda message: None,
 ) -> list[dict[str, Any]]:
     """Rows of experiments.

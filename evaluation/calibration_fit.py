@@ -6,10 +6,9 @@ truth; weights are then fitted to that by gradient, since only the mixing of the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
-from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,6 +22,8 @@ from ..matching.bayes_solve import decode
 from ..matching.metrics import expected_calibration_error
 from ..matching.pose import Array
 from .datasets import Frame, View, load_dataset
+from .progress import Progress, silent
+from .run_dataset import pairs as pairs_of
 from .synthetic import PREFIX, problem_names
 from .synthetic import frames as generated
 
@@ -61,18 +62,13 @@ def fittable() -> list[str]:
     return [kind for kind, x in CALIBRATIONS.items() if x.damping.any()]
 
 
-def pairs_of(frame: Frame) -> list[tuple[View, View]]:
-    """Pairs of robots with at least 3 detections each."""
-    return [(a, b) for a, b in combinations(frame.views, 2) if min(len(a.graph), len(b.graph)) >= 3]
-
-
 def collect(
     target: str,
     kind: str,
     *,
     frames: int | None = None,
     seed: int = 0,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = silent,
 ) -> list[PairEvidence]:
     """The evidence of all pairs of views of a dataset folder, or of generated pairs.
 
@@ -91,13 +87,11 @@ def collect(
         every = list(generated(problem, seed, range(100 if frames is None else frames)))
         every = [_hidden(frame) for frame in every] if kind == "unseen" else every
     else:
-        data = load_dataset(target, seed)
-        number = len(data) if frames is None else min(frames, len(data))
-        every = [data.frame(i * len(data) // number) for i in range(number)]
+        every = load_dataset(target, seed).spread(frames)
     found = []
     for done, frame in enumerate(every):
         progress(done, len(every))
-        found += [_solved(target.rstrip("/").rpartition("/")[2], frame.episode, a, b) for a, b in pairs_of(frame)]
+        found += [_solved(target.rstrip("/").rpartition("/")[2], frame.episode, a, b) for _, a, b in pairs_of(frame)]
     return found
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,8 @@ import pyarrow.parquet as pq
 
 from .dataset_check import check
 from .dataset_tables import DatasetError, bad_row, read_json
-from .shards import write_atomically
+from .files import write_atomically
+from .progress import Progress, silent
 
 ANNOTATIONS, RESULTS, IMAGES = "annotations.json", "detections.json", "images"
 KEPT = ("frame", "robot", "episode", "time", "intrinsics", "pose", "pose_truth")
@@ -42,7 +43,7 @@ def export_coco(
     out: Path,
     *,
     overwrite: bool = False,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = silent,
 ) -> Exported:
     """Write a dataset folder with images as a COCO data set; `annotations.json`, which makes it one, comes last.
 
@@ -85,9 +86,7 @@ def _prepare(out: Path, overwrite: bool) -> None:
     (out / IMAGES).mkdir(parents=True, exist_ok=True)
 
 
-def _write_images(
-    folder: Path, images: Path, size: list[int], progress: Callable[[int, int], None]
-) -> list[dict[str, Any]]:
+def _write_images(folder: Path, images: Path, size: list[int], progress: Progress) -> list[dict[str, Any]]:
     """Every image as a file, and its entry; robots without one in a frame are left out."""
     file = folder / "robots.parquet"
     total = pq.read_metadata(file).num_rows

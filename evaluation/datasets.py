@@ -127,6 +127,11 @@ class Dataset:
         time = None if time is None or np.isnan(time) else time
         return Frame(index, int(self.episode[i]), time, tuple(self._view(row) for row in rows))
 
+    def spread(self, number: int | None) -> list[Frame]:
+        """At most so many frames, evenly spread over all; None = all."""
+        n = len(self) if number is None else min(number, len(self))
+        return [self.frame(i * len(self) // n) for i in range(n)]
+
     def _view(self, row: int) -> View:
         robots, detections, meta = self._robots, self._detections, self._meta
         robot, frame = str(robots["robot"][row]), int(robots["frame"][row])

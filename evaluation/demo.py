@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from .benchmark import benchmark
 from .extras import require_scene
+from .files import write_atomically
 from .methods import Method
+from .progress import Progress, silent
 from .settings import SCENE_NAMES, Settings
-from .shards import write_atomically
 
 METHODS = ("random", "reid", "rgm", "bayes", "oracle")
 EPISODES = 2
@@ -27,9 +28,7 @@ COLUMNS = (
 )
 
 
-def demo(
-    out: Path, seed: int = 0, progress: Callable[[int, int], None] = lambda done, total: None
-) -> list[dict[str, Any]]:
+def demo(out: Path, seed: int = 0, progress: Progress = silent) -> list[dict[str, Any]]:
     """Run the demo into a folder: rows.json, report.md and, per scene, pictures of every method's matches.
 
     Raises:

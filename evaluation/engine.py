@@ -18,6 +18,7 @@ from ..matching import PriorRequiredError
 from .executors import Done, Executor, RunOne, processes, serial
 from .experiments import Unit
 from .extras import MissingExtraError
+from .progress import Progress, silent
 from .records import Tally, tallies
 from .shards import RECORDS, Shards, facts
 
@@ -63,7 +64,7 @@ def run(
     shards: Shards | None = None,
     shared_folder: bool = True,
     about: Mapping[str, Any] | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = silent,
     complain: Callable[[str], object] = lambda message: None,
 ) -> Results:
     """Run all units that `shards` does not hold yet.

@@ -25,11 +25,11 @@ from ..matching.metrics import Counts, count, is_correct, pooled
 from ..matching.multiway import Method, consistent, is_consistent
 from ..matching.pose import Array
 from .localization_team import FAULTS, BayesMatches, Fault, Instant, Sight, TrueMatches, instants, play
+from .progress import Progress, silent
 from .settings import Settings
 
 Row = dict[str, Any]
 Mask = NDArray[np.bool_]
-Progress = Callable[[int, int], None]
 
 PARTS = ("scenes", "faults", "team")
 MIN_SCORE = 0.9
@@ -100,7 +100,7 @@ def localization_rows(
     perception: str = "simulated",
     min_score: float = MIN_SCORE,
     exact_poses: bool = False,
-    progress: Progress = lambda done, total: None,
+    progress: Progress = silent,
 ) -> list[Row]:
     """Rows of the parts: scenes x estimators, faults x protections, sizes of the team.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from ..envs.claims import Claims, claims_to_action
+from ..envs.claims import silent_actions
 from ..envs.scenes import SCENES, parallel_env
 from .memory_matching import STATUS, resident_mib
+from .progress import Progress, silent
 
 RESETS, STEPS = 1_000, 100_000
 FIRST = 100
@@ -36,7 +37,7 @@ class Growth:
 
 
 def rows(
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = silent,
     *,
     resets: int = RESETS,
     steps: int = STEPS,
@@ -91,11 +92,10 @@ def growth(scene: str, resets: int, steps: int) -> Growth:
 
 def _play(env: Any, rng: np.random.Generator, steps: int) -> int:
     """Random controls that claim nothing, for so many steps or until a collision; how many there were."""
-    nothing = Claims.empty(env.max_detections, len(env.possible_agents) - 1)
     done = 0
     while env.agents and done < steps:
         controls = rng.uniform(-1, 1, (len(env.agents), env.world.control_size))
-        env.step({a: claims_to_action(nothing, control) for a, control in zip(env.agents, controls, strict=True)})
+        env.step(silent_actions(env.agents, controls, env.max_detections))
         done += 1
     return done
 

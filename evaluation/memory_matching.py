@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..matching.testing import MatchingProblem
+from .progress import Progress, silent
 from .timing import row
 
 STATUS = Path("/proc/self/status")
@@ -31,7 +31,7 @@ def add_memory(measured: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return [r | {"memory_mib": m} for r, m in zip(measured, used, strict=True)]
 
 
-def rows(progress: Callable[[int, int], None] = lambda done, total: None) -> list[dict[str, Any]]:
+def rows(progress: Progress = silent) -> list[dict[str, Any]]:
     """One row per built-in method: MiB of a solve at the largest size it accepts, up to the figure's largest.
 
     All objects are of one class, so that no method can leave candidates out.

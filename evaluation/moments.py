@@ -19,22 +19,13 @@ from ..fusion.team import GATE, fuse_team
 from ..matching import Matching, ObjectGraph, RelativePose
 from ..matching.metrics import Counts, count, is_correct
 from ..matching.pose import Array, invert, transform
-from .datasets import (
-    Dataset,
-    DatasetError,
-    Frame,
-    Stored,
-    View,
-    load_dataset,
-    optional_column,
-    prior_between,
-    true_relative_pose,
-)
-from .matching_run import PairTruth, match_pair
+from .datasets import Dataset, DatasetError, Frame, Stored, View, load_dataset, optional_column, prior_between
+from .matching_run import match_pair
 from .methods import Method
 from .pictures import jpeg
+from .run_dataset import begin, of_views, pairs
 from .sequence import PairTrackers
-from .settings import MIN_DETECTIONS, Settings
+from .settings import Settings
 
 Matchings = dict[tuple[int, int], Matching]
 FRAMES_AT_ONCE = 50
@@ -197,9 +188,7 @@ def _dataset_moments(
         pictures = _Pictures.read(dataset.path, dataset.frame_index[chunk].tolist())
         for i in chunk.tolist():
             frame = dataset.frame(i)
-            if trackers is not None:
-                odometry = {view.robot: view.odometry for view in frame.views}
-                trackers.begin(frame.episode, odometry, {view.robot: view.graph for view in frame.views})
+            begin(trackers, frame)
             sightings = tuple(pictures.sighting(frame.index, view) for view in frame.views)
             results = {m.label: judge(sightings, _match(dataset, frame, m, settings, trackers)) for m in methods}
             yield Moment(frame.index, frame.episode, frame.time, sightings, _things(sightings), results)
@@ -209,20 +198,10 @@ def _match(
     dataset: Dataset, frame: Frame, method: Method, settings: Settings, trackers: PairTrackers | None
 ) -> Matchings:
     found: Matchings = {}
-    for (i, source), (j, target) in combinations(enumerate(frame.views), 2):
-        if min(len(source.graph), len(target.graph)) < MIN_DETECTIONS:
-            continue
-        found[i, j], _ = match_pair(
-            method,
-            source.graph,
-            target.graph,
-            PairTruth((source.identity, target.identity), true_relative_pose(source, target)),
-            prior_between(source, target) if settings.pose == "known" else None,
-            (settings.seed, frame.index, i * len(frame.views) + j),
-            f"{dataset.name}, frame {frame.index}, {source.robot} and {target.robot}",
-            None if trackers is None else trackers.of(method.label, source.robot, target.robot),
-            None if trackers is None else trackers.maps(source.robot, target.robot),
-        )
+    for _, source, target in pairs(frame):
+        prior = prior_between(source, target) if settings.pose == "known" else None
+        pair = frame.views.index(source), frame.views.index(target)
+        found[pair], _ = match_pair(**of_views(dataset.name, frame, pair, method, prior, settings, trackers))
     return found
 
 

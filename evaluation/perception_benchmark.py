@@ -6,7 +6,7 @@ everything else over detections whose mask meets a true object's with IoU >= 0.5
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,6 +19,7 @@ from ..matching.pose import Array
 from .extras import MissingExtraError, require
 from .perception_images import PerceptionTarget, default_targets
 from .perception_tally import Tally, tally
+from .progress import Progress, silent
 
 if TYPE_CHECKING:
     from ..agents.perception.weights import Weights
@@ -35,7 +36,7 @@ def perception_benchmark(
     seed: int = 0,
     split_key: int | None = None,
     samples: int = 16,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = silent,
 ) -> list[dict[str, Any]]:
     """One row per target.
 
@@ -94,7 +95,7 @@ def weights_of(eyes: str) -> Weights:
     return stored.load(Path(folder) if folder else None)
 
 
-def _part_of(progress: Callable[[int, int], None], part: int, size: int, parts: int, done: int) -> None:
+def _part_of(progress: Progress, part: int, size: int, parts: int, done: int) -> None:
     progress(part * size + done, parts * size)
 
 

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 STEPS_BETWEEN = 5
 INSTANTS = 3
+"""Of each episode that are looked at, so many steps apart."""
 
 
 @dataclass(frozen=True)
@@ -29,9 +30,8 @@ class PerceptionTarget:
 
     @property
     def name(self) -> str:
-        return ":".join([self.scene, *([self.preset] if self.preset != "paper" else []), *([self.map or ""])]).rstrip(
-            ":"
-        )
+        preset = self.preset if self.preset != "paper" else None
+        return ":".join(filter(None, (self.scene, preset, self.map)))
 
 
 def default_targets() -> tuple[PerceptionTarget, ...]:
@@ -92,16 +92,12 @@ def test_images(env: CollaborativeEnv, number: int, seed: tuple[int, int]) -> It
 
 def _advance(env: CollaborativeEnv, observations: dict[str, Any]) -> bool:
     """Let some steps pass, in place; False when the episode has ended."""
-    from ..agents.controllers import scripted_controls
-    from ..envs.claims import Claims, claims_to_action
+    from .run_scene import step_scripted
 
     for _ in range(STEPS_BETWEEN):
         if not env.agents:
             return False
-        silent = Claims.empty(env.max_detections, len(env.possible_agents) - 1)
-        controls = scripted_controls(env.world)
-        fresh, *_ = env.step({a: claims_to_action(silent, controls[i]) for i, a in enumerate(env.agents)})
-        observations.update(fresh)
+        observations.update(step_scripted(env))
     return bool(env.agents)
 
 

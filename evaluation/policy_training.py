@@ -8,7 +8,6 @@ that was killed and resumed ends with the same weights as one that was not.
 from __future__ import annotations
 
 import json
-import os
 import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -24,7 +23,8 @@ from ..agents.localizer import Localizer
 from ..agents.perception import make_perceptor
 from ..agents.wrapper import LocalizeWrapper
 from ..envs.scenes import parallel_env
-from .shards import write_atomically
+from .files import replacing, write_atomically
+from .progress import Progress, silent
 from .statistics import bootstrap_mean
 
 Controls = Callable[[ClaimObservations, dict[str, NDArray[np.float32]]], dict[str, NDArray[np.float32]]]
@@ -186,9 +186,8 @@ def _iterate(model: Any, vector: Any, seed: int, iteration: int) -> None:
 
 
 def _save(model: Any, file: Path) -> None:
-    temporary = file.with_name(f"{file.stem}.{os.getpid()}.zip")
-    model.save(temporary)
-    os.replace(temporary, file)
+    with replacing(file) as temporary:
+        model.save(temporary)
 
 
 def _log(out: Path) -> list[dict[str, float]]:
@@ -231,7 +230,7 @@ def evaluate_policy(
     params: PolicyParams,
     policy: Controls,
     episodes: int = 40,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = silent,
 ) -> list[dict[str, Any]]:
     """The policy beside the scripted controllers, random ones and none, on the same episodes, none of the training.
 

@@ -1,4 +1,4 @@
-"""Scenes to dataset folders: `covis record`, resumable; and `covis check`, which verifies a folder.
+"""Scenes to dataset folders: `covis record`, resumable.
 
 Each episode is one set of part files, each written whole by an atomic rename; the final tables are streamed from the
 parts, so that memory holds one episode. A folder without dataset.json is unfinished, and no reader opens it.
@@ -8,81 +8,35 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
 from .data_card import card
+from .dataset_schemas import TABLES
 from .dataset_tables import FORMAT, VERSION
 from .datasets import UNFINISHED
 from .engine import make_executor
 from .executors import Done, Executor, Failure
+from .files import replacing, write_atomically
+from .progress import Progress, silent
+from .recording_rows import Rows, frames
 from .settings import Settings, scene_preset
-from .shards import write_atomically
 
-FLOATS = pa.list_(pa.float64())
-RUNS = pa.list_(pa.int32())
-ROBOTS = pa.schema(
-    [
-        ("frame", pa.int64()),
-        ("time", pa.float64()),
-        ("robot", pa.string()),
-        ("episode", pa.int32()),
-        ("pose", FLOATS),
-        ("pose_truth", FLOATS),
-        ("odometry", FLOATS),
-        ("intrinsics", FLOATS),
-        ("up", FLOATS),
-        ("image", pa.binary()),
-    ]
-)
-DETECTIONS = pa.schema(
-    [
-        ("frame", pa.int64()),
-        ("robot", pa.string()),
-        ("detection", pa.int32()),
-        ("identity", pa.int64()),
-        ("position", FLOATS),
-        ("position_variance", pa.float64()),
-        ("attribute", FLOATS),
-        ("attribute_variance", pa.float64()),
-        ("covariance", FLOATS),
-        ("embedding", FLOATS),
-        ("box", FLOATS),
-        ("mask", RUNS),
-        ("truth", FLOATS),
-    ]
-)
-OBJECTS = pa.schema(
-    [
-        ("frame", pa.int64()),
-        ("robot", pa.string()),
-        ("identity", pa.int64()),
-        ("class", pa.string()),
-        ("position", FLOATS),
-        ("pixels", pa.int32()),
-        ("box", FLOATS),
-        ("mask", RUNS),
-    ]
-)
-TABLES = {"robots": ROBOTS, "detections": DETECTIONS, "objects": OBJECTS}
 CHECKSUMS = "checksums.json"
 REQUEST = UNFINISHED
 HEAD = "dataset.json"
 FILES = (HEAD, CHECKSUMS, "README.md", *(f"{table}.parquet" for table in TABLES))
 FRAMES_PER_EPISODE_NUMBER = 1000
+"""Frames are numbered through: so many numbers for each episode, whether it has as many steps or not."""
 EPISODES = 50
-
-Rows = dict[str, list[dict[str, Any]]]
+"""Unless the settings say otherwise."""
 
 
 def record(
@@ -93,7 +47,7 @@ def record(
     workers: int = 1,
     resume: bool = False,
     overwrite: bool = False,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = silent,
 ) -> None:
     """Write `settings.episodes` episodes of a scene as a dataset folder, images and masks included.
 
@@ -214,9 +168,7 @@ class RecordOne:
         return Done(None)
 
 
-def _record_parts(
-    record_one: RecordOne, episodes: int, executor: Executor, progress: Callable[[int, int], None]
-) -> None:
+def _record_parts(record_one: RecordOne, episodes: int, executor: Executor, progress: Progress) -> None:
     """Part files of every episode that has none yet. Raises what an episode raised, or that its worker died."""
     todo = [e for e in range(episodes) if not all(_part(record_one.parts, table, e).exists() for table in TABLES)]
     done = episodes - len(todo)
@@ -236,94 +188,13 @@ def _own_env(scene: str, settings: Settings) -> Any:
 
 def _write_episode(env: Any, episode: int, settings: Settings, parts: Path) -> None:
     tables: Rows = {table: [] for table in TABLES}
-    for step, rows in enumerate(_frames(env, episode, settings)):
+    for step, rows in enumerate(frames(env, episode, settings)):
         where = {"frame": FRAMES_PER_EPISODE_NUMBER * episode + step, "episode": episode}
         for table in TABLES:
             tables[table] += [where | row for row in rows[table]]
     for table, schema in TABLES.items():
-        file = _part(parts, table, episode)
-        temporary = file.with_suffix(f".{os.getpid()}.tmp")
-        pq.write_table(pa.Table.from_pylist(tables[table], schema=schema), temporary)
-        os.replace(temporary, file)
-
-
-def _frames(env: Any, episode: int, settings: Settings) -> Iterator[Rows]:
-    """The rows of each step."""
-    from .run_scene import identity, look_around, make_eyes, step_scripted
-
-    perceive = make_eyes(settings, env)
-    observations, _ = env.reset(seed=[settings.seed, episode])
-    step = 0
-    while env.agents:
-        views = look_around(env, perceive, observations, (settings.seed, episode, step))
-        rows: Rows = {table: [] for table in TABLES}
-        for i, (agent, view) in enumerate(zip(env.agents, views, strict=True)):
-            rows["robots"].append(_robot_row(env, i, agent, observations[agent]))
-            rows["detections"] += _detection_rows(env, agent, view, identity(view, i, env))
-            rows["objects"] += _object_rows(env, i, agent)
-        yield rows
-        observations = step_scripted(env)
-        step += 1
-
-
-def _robot_row(env: Any, i: int, agent: str, seen: dict[str, Any]) -> dict[str, Any]:
-    import cv2
-
-    image = cv2.imencode(".png", cv2.cvtColor(seen["image"], cv2.COLOR_RGB2BGR))[1].tobytes()
-    return {
-        "time": env.snapshot().time,
-        "robot": agent,
-        "pose_truth": _flat(env.ground_truth().T_world_camera[i]),
-        "image": image,
-    } | {name: _flat(seen[name]) for name in ("pose", "odometry", "intrinsics", "up")}
-
-
-def _detection_rows(env: Any, agent: str, view: Any, identities: NDArray[np.int64]) -> list[dict[str, Any]]:
-    truth, graph, masks = env.ground_truth(), view.detections.graph, view.detections.masks
-    place = dict(zip(truth.identity.tolist(), truth.positions.tolist(), strict=True))
-    covariances = graph.full_covariances()
-    return [
-        {
-            "robot": agent,
-            "detection": k,
-            "identity": int(identities[k]),
-            "position": _flat(graph.positions[k]),
-            "position_variance": float(graph.position_variance[k]),
-            "attribute": _flat(graph.attributes[k]),
-            "attribute_variance": float(graph.attribute_variance[k]),
-            "covariance": _flat(covariances[k]),
-            "embedding": None if graph.embedding is None else _flat(graph.embedding[k]),
-            "box": _flat(view.detections.boxes[k]),
-            "mask": None if masks is None else run_lengths(masks[k]),
-            "truth": place.get(int(identities[k])),
-        }
-        for k in range(len(graph))
-    ]
-
-
-def _object_rows(env: Any, i: int, agent: str) -> list[dict[str, Any]]:
-    """What the i-th robot's image really shows, of every object with a visible pixel."""
-    truth, instances = env.ground_truth(), env.camera_frames()[i].instances
-    return [
-        {
-            "robot": agent,
-            "identity": int(truth.identity[k]),
-            "class": env.classes[truth.object_class[k]],
-            "position": _flat(truth.positions[k]),
-            "pixels": int(truth.pixels[i, k]),
-            "box": _flat(truth.boxes[i, k]),
-            "mask": run_lengths(instances == k),
-        }
-        for k in np.flatnonzero(truth.pixels[i])
-    ]
-
-
-def run_lengths(mask: NDArray[np.bool_]) -> list[int]:
-    """COCO's run lengths of a mask (H, W): column by column, in turn outside and inside, outside first."""
-    flat = mask.ravel(order="F")
-    changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
-    lengths = np.diff([0, *changes.tolist(), len(flat)]).tolist()
-    return [0, *lengths] if flat[0] else lengths
+        with replacing(_part(parts, table, episode)) as temporary:
+            pq.write_table(pa.Table.from_pylist(tables[table], schema=schema), temporary)
 
 
 def _head(scene: str, env: Any, settings: Settings) -> dict[str, Any]:
@@ -352,11 +223,9 @@ def _sizes(out: Path) -> dict[str, tuple[int, int]]:
 
 def _concatenate(parts: Sequence[Path], file: Path, schema: pa.Schema) -> None:
     """One row group an episode; each page has a checksum of its own, so that readers notice damage by themselves."""
-    temporary = file.with_name(f"{file.name}.{os.getpid()}.tmp")
-    with pq.ParquetWriter(temporary, schema, write_page_checksum=True) as writer:
+    with replacing(file) as temporary, pq.ParquetWriter(temporary, schema, write_page_checksum=True) as writer:
         for part in parts:
             writer.write_table(pq.read_table(part, schema=schema))
-    os.replace(temporary, file)
 
 
 def _checksums(out: Path, head: bytes) -> dict[str, str]:
@@ -367,7 +236,3 @@ def _checksums(out: Path, head: bytes) -> dict[str, str]:
 def sha256(file: Path) -> str:
     with file.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-def _flat(values: Any) -> list[float]:
-    return np.asarray(values, dtype=np.float64).ravel().tolist()

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..matching import Matching
+from ..matching import Matching, RelativePose
 from ..matching.metrics import Counts, is_correct
 from .dataset_errors import Matched, fused, with_errors
 from .dataset_pages import page, shared
@@ -45,9 +45,7 @@ def run_frames(
     records: list[Record] = []
     trackers = PairTrackers() if settings.sequence else None
     for frame in frames:
-        if trackers is not None:
-            odometry = {view.robot: view.odometry for view in frame.views}
-            trackers.begin(frame.episode, odometry, {view.robot: view.graph for view in frame.views})
+        begin(trackers, frame)
         found, scored = [], []
         for pair in pairs(frame, 0 if trackers is not None else settings.min_common):
             matched = list(_match_all(name, pair, methods, settings, trackers))
@@ -80,6 +78,37 @@ def n_common(source: View, target: View) -> int:
     return int((common >= 0).sum())
 
 
+def begin(trackers: PairTrackers | None, frame: Frame) -> None:
+    """Carry the trackers, where there are any, on to a frame."""
+    if trackers is not None:
+        odometry = {view.robot: view.odometry for view in frame.views}
+        trackers.begin(frame.episode, odometry, {view.robot: view.graph for view in frame.views})
+
+
+def of_views(
+    name: str,
+    frame: Frame,
+    pair: tuple[int, int],
+    method: Method,
+    prior: RelativePose | None,
+    settings: Settings,
+    trackers: PairTrackers | None,
+) -> dict[str, Any]:
+    """Arguments of `match_pair` and `attempt` for two views of a frame of the target called `name`, by their numbers."""
+    source, target = (frame.views[i] for i in pair)
+    return {
+        "method": method,
+        "source": source.graph,
+        "target": target.graph,
+        "truth": PairTruth((source.identity, target.identity), true_relative_pose(source, target)),
+        "prior": prior,
+        "stream": (settings.seed, frame.index, pair[0] * len(frame.views) + pair[1]),
+        "where": f"{name}, frame {frame.index}, {source.robot} and {target.robot}",
+        "tracker": None if trackers is None else trackers.of(method.label, source.robot, target.robot),
+        "maps": None if trackers is None else trackers.maps(source.robot, target.robot),
+    }
+
+
 def _match_all(
     name: str,
     pair: tuple[Frame, View, View],
@@ -89,26 +118,14 @@ def _match_all(
 ) -> Iterator[Matched]:
     """What each method makes of a pair of views."""
     frame, source, target = pair
-    truth = PairTruth((source.identity, target.identity), true_relative_pose(source, target))
     where = f"{name}, frame {frame.index}, {source.robot} and {target.robot}"
     try:
         prior = prior_between(source, target) if settings.pose == "known" else None
     except DatasetError as error:
         raise DatasetError(f"{where}: {error}") from error
     a, b = frame.views.index(source), frame.views.index(target)
-    number = a * len(frame.views) + b
     for method in methods:
-        matching, elapsed, failure = attempt(
-            method,
-            source.graph,
-            target.graph,
-            truth,
-            prior,
-            (settings.seed, frame.index, number),
-            where,
-            None if trackers is None else trackers.of(method.label, source.robot, target.robot),
-            None if trackers is None else trackers.maps(source.robot, target.robot),
-        )
+        matching, elapsed, failure = attempt(**of_views(name, frame, (a, b), method, prior, settings, trackers))
         record = Record.of_matching(
             matching,
             source.identity,

@@ -19,7 +19,7 @@ from ..agents.controllers import scripted_controls
 from ..agents.localizer import Matchings, View, claims, look, relative_pose
 from ..agents.perception import Perceptor, make_perceptor
 from ..agents.perception.simulated import OCCLUSION, measure
-from ..envs.claims import Claims, claims_to_action
+from ..envs.claims import Claims, silent_actions
 from ..envs.collaborative import CollaborativeEnv
 from ..envs.scenes import parallel_env
 from ..envs.scoring import PairScore, StepScore, Truth, score, tie
@@ -117,9 +117,7 @@ def look_around(
 
 def step_scripted(env: CollaborativeEnv) -> dict[str, Any]:
     """Move by the scene's scripted controllers, claiming nothing; the next observations."""
-    controls = scripted_controls(env.world)
-    nothing = Claims.empty(env.max_detections, len(env.agents) - 1)
-    observations, *_ = env.step({a: claims_to_action(nothing, controls[i]) for i, a in enumerate(env.agents)})
+    observations, *_ = env.step(silent_actions(env.agents, scripted_controls(env.world), env.max_detections))
     return observations
 
 

@@ -17,6 +17,8 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from .files import replacing, write_json
+
 RUN, ROWS = "run.json", "rows.json"
 RECORDS, PICTURES = "records", "pictures"
 """Folders of shards: a unit's records, and the frames that a report shows of it."""
@@ -86,16 +88,10 @@ class Shards:
         return self.out / folder / f"unit-{number:05d}.parquet"
 
     def _write(self, table: pa.Table, file: Path) -> None:
-        temporary = file.with_suffix(f".{os.getpid()}.tmp")
-        try:
-            with temporary.open("wb") as stream:
-                pq.write_table(table, stream, write_page_checksum=True)
-                stream.flush()
-                os.fsync(stream.fileno())
-            os.replace(temporary, file)
-        except BaseException:
-            temporary.unlink(missing_ok=True)
-            raise
+        with replacing(file) as temporary, temporary.open("wb") as stream:
+            pq.write_table(table, stream, write_page_checksum=True)
+            stream.flush()
+            os.fsync(stream.fileno())
 
     def _whole(self, number: int) -> bool:
         try:
@@ -114,13 +110,3 @@ def facts(schema: pa.Schema) -> dict[str, Any]:
 
 def with_facts(table: pa.Table, **about: Any) -> pa.Table:
     return table.replace_schema_metadata({FACTS: json.dumps(about).encode()})
-
-
-def write_json(file: Path, content: Any) -> None:
-    write_atomically(file, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
-
-
-def write_atomically(file: Path, content: bytes) -> None:
-    temporary = file.with_name(f"{file.name}.{os.getpid()}.tmp")
-    temporary.write_bytes(content)
-    os.replace(temporary, file)

@@ -15,13 +15,14 @@ import numpy as np
 from ..agents.controllers import scripted_controls
 from ..envs.camera.comparison import contenders
 from ..envs.camera.raster import PLAIN
-from ..envs.claims import Claims, claims_to_action
+from ..envs.claims import Claims, silent_actions
 from ..envs.collaborative import CollaborativeEnv
 from ..envs.scenes import SCENES, parallel_env
 from ..envs.scoring import score
 from ..envs.worlds.driving import ConnectedDrivingWorld
 from ..envs.worlds.multi_robot import MultiRobotWorld
 from ..envs.worlds.peers import TinyPeer, speed_params
+from .progress import Progress, silent
 from .timing import rates, row
 
 N_ROBOTS = 15
@@ -31,7 +32,7 @@ SIZES = ((160, 120), (320, 240), (640, 480))
 TEAMS = (15, 30)
 
 
-def rows(progress: Callable[[int, int], None] = lambda done, total: None) -> list[dict[str, Any]]:
+def rows(progress: Progress = silent) -> list[dict[str, Any]]:
     """One row per camera size, environment and reset; `n` is the number of robots or vehicles in the scene."""
     jobs: list[Callable[[], dict[str, Any]]] = [
         partial(camera, 160, 120),
@@ -147,7 +148,6 @@ def connected_driving() -> dict[str, Any]:
     from ..envs.worlds.highway_peer import bare_intersection
 
     env = parallel_env("connected_driving")
-    nothing = Claims.empty(env.max_detections, len(env.possible_agents) - 1)
     world = env.world
     assert isinstance(world, ConnectedDrivingWorld)
     mine, theirs, vehicles = [], [], []
@@ -158,8 +158,7 @@ def connected_driving() -> dict[str, Any]:
             vehicles.append(len(world.traffic()))
             steps, seconds = 0, 0.0
             while env.agents:
-                controls = scripted_controls(world)
-                actions = {a: claims_to_action(nothing, controls[i]) for i, a in enumerate(env.agents)}
+                actions = silent_actions(env.agents, scripted_controls(world), env.max_detections)
                 start = process_time()
                 env.step(actions)
                 seconds += process_time() - start
@@ -207,6 +206,5 @@ def _rate(job: Callable[[], object], times: int) -> float:
 
 def stepper(env: CollaborativeEnv, controls: Any) -> Callable[[], object]:
     """A step with fixed controls that claims nothing."""
-    nothing = Claims.empty(env.max_detections, len(env.possible_agents) - 1)
-    actions = {a: claims_to_action(nothing, controls[i]) for i, a in enumerate(env.possible_agents)}
+    actions = silent_actions(env.possible_agents, controls, env.max_detections)
     return lambda: env.step(actions)

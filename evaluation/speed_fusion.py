@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,12 +11,13 @@ from ..fusion.sequence import PairTracker
 from ..fusion.tracking import Batch, Tracker
 from ..matching import METHODS, Matching, ObjectGraph, RelativePose
 from ..matching.pose import Array, exp_se3, invert, transform
+from .progress import Progress, silent
 from .timing import rates, row
 
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def rows(progress: Callable[[int, int], None] = lambda done, total: None) -> list[dict[str, Any]]:
+def rows(progress: Progress = silent) -> list[dict[str, Any]]:
     """`fuse_8x50`: 8 robots, 50 objects each; `sequence_loop`: match, fuse, track, two robots of 15 objects."""
     progress(0, 2)
     fused = fuse_many()

@@ -12,6 +12,7 @@ import numpy as np
 from ..matching import METHODS
 from ..matching.adapters import pygm
 from ..matching.testing import MatchingProblem, scene
+from .progress import Progress, silent
 from .timing import rates, row
 
 SIZES = (5, 15, 50, 100, 200)
@@ -26,7 +27,7 @@ LONGEST_SOLVE_S = 10.0
 """A method is not measured at a size after one where a single solve took longer than this."""
 
 
-def rows(progress: Callable[[int, int], None] = lambda done, total: None) -> list[dict[str, Any]]:
+def rows(progress: Progress = silent) -> list[dict[str, Any]]:
     """One row per method and size it accepts; `n` is the number of objects a side.
 
     The rows `rrwm` run a fixed number of steps and normalisations, the same as their peer, pygmtools' RRWM on the same

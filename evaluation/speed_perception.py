@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,10 +9,11 @@ import numpy as np
 from ..agents.localizer import Localizer
 from ..agents.perception import make_perceptor
 from ..envs.scenes import parallel_env
+from .progress import Progress, silent
 from .timing import rates, row
 
 
-def rows(progress: Callable[[int, int], None] = lambda done, total: None) -> list[dict[str, Any]]:
+def rows(progress: Progress = silent) -> list[dict[str, Any]]:
     """`images`: 320x240, the shipped number of samples; `loop`: two robots, look, match by bayes, fuse.
 
     Raises:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from itertools import combinations, product
+from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,8 @@ import numpy as np
 from ..matching import METHODS
 from ..matching.metrics import count, pooled
 from .datasets import View, load_dataset
+from .progress import Progress, silent
+from .run_dataset import pairs
 
 Setting = dict[str, Any]
 """Options of a matcher."""
@@ -54,7 +56,7 @@ def compare_settings(
     *,
     frames: int | None = None,
     seed: int = 0,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = silent,
     **options: Any,
 ) -> list[dict[str, Any]]:
     """Pooled precision, recall and F1 of a method for every setting, on dataset folders, poses unknown.
@@ -79,11 +81,11 @@ def compare_settings(
         raise ValueError(f"frames must be at least 1, got {frames}")
     rows: list[dict[str, Any]] = []
     for target in targets:
-        pairs = view_pairs(target, frames, seed)
+        found = view_pairs(target, frames, seed)
         for setting in settings:
             progress(len(rows), len(targets) * len(settings))
-            found = _score(pairs, method, seed, {**options, **setting})
-            rows.append({"target": Path(target).name, **setting, **found})
+            score = _score(found, method, seed, {**options, **setting})
+            rows.append({"target": Path(target).name, **setting, **score})
     progress(len(rows), len(rows))
     return rows
 
@@ -108,11 +110,8 @@ def setting_of(row: Mapping[str, Any]) -> Setting:
 
 
 def view_pairs(target: str | Path, frames: int | None, seed: int) -> list[tuple[View, View]]:
-    """Every pair of robots with at least 3 detections each, of at most `frames` frames, evenly spread."""
-    every = list(load_dataset(target, seed))
-    number = len(every) if frames is None else min(frames, len(every))
-    chosen = [every[i * len(every) // number] for i in range(number)]
-    return [(a, b) for frame in chosen for a, b in combinations(frame.views, 2) if min(len(a.graph), len(b.graph)) >= 3]
+    """Every pair of views with enough detections, of at most `frames` frames, evenly spread."""
+    return [(a, b) for frame in load_dataset(target, seed).spread(frames) for _, a, b in pairs(frame)]
 
 
 def _score(pairs: list[tuple[View, View]], method: str, seed: int, options: Setting) -> dict[str, Any]:

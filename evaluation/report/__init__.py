@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..shards import write_atomically
+from ..files import write_atomically
 from . import markdown, page
 from .run import RunFolderError, load
 

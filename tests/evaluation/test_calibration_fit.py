@@ -140,6 +140,8 @@ def test_command(tmp_path):
     assert (written["kind"], len(written["terms"])) == ("fields", N_FEATURES)
     assert [row["target"] for row in written["rows"]] == ["synthetic-cad-hard", "synthetic-cad-mid"]
     made = "synthetic-cad-hard"
+    printed = run(app, ["train", "calibration", "fields", made, "--frames", "4", "--json", "-"])
+    assert json.loads(printed.stdout)["rows"][0]["target"] == made
     for wrong in (["whole", made], ["fields", "nowhere"], ["fields", made, "--weight", made], ["eyes", made]):
         assert run(app, ["train", "calibration", *wrong, "--frames", "3"]).exit_code == 2
     assert "whole" not in fittable()

@@ -5,14 +5,9 @@ import numpy as np
 import pytest
 
 from covis.evaluation.datasets import load_dataset, true_relative_pose
-from covis.evaluation.mrclam import (
-    UNCALIBRATED,
-    MrclamError,
-    calibrate,
-    import_mrclam,
-    integrate_odometry,
-    pose_at,
-)
+from covis.evaluation.mrclam import import_mrclam
+from covis.evaluation.mrclam_files import MrclamError
+from covis.evaluation.mrclam_odometry import UNCALIBRATED, calibrate, integrate_odometry, pose_at
 from covis.matching.pose import invert, transform
 
 START = 1_000_000.0

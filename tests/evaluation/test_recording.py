@@ -18,6 +18,7 @@ from covis.evaluation.dataset_check import Checked, ChecksumError, check
 from covis.evaluation.datasets import DatasetError, load_dataset
 from covis.evaluation.methods import Method
 from covis.evaluation.recording import record
+from covis.evaluation.recording_rows import run_lengths
 from covis.evaluation.settings import Settings
 
 SCENE = "box_world:BoxWorld"
@@ -136,7 +137,7 @@ def test_hugging_face_reads_it(recorded, monkeypatch, tmp_path):
 
 @pytest.mark.parametrize("mask", [[[0, 1], [1, 0]], [[1, 1], [1, 1]], [[0, 0], [0, 0]], [[1, 0], [0, 0]]])
 def test_run_lengths_are_cocos(mask):
-    runs = recording.run_lengths(np.array(mask, dtype=bool))
+    runs = run_lengths(np.array(mask, dtype=bool))
     np.testing.assert_array_equal(coco_mask.decode(coco_mask.frPyObjects({"counts": runs, "size": [2, 2]}, 2, 2)), mask)
 
 

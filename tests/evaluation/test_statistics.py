@@ -71,6 +71,13 @@ def test_equal_methods_do_not_differ():
     assert d.noise
 
 
+def test_episodes_are_paired_by_their_keys_in_whatever_order():
+    own, other = sums([9, 5, 7, 2, 8, 6]), sums([8, 4, 6, 1, 7, 5])
+    turned = dict(reversed(other.items()))
+    assert paired_difference(own, turned) == paired_difference(own, other)
+    assert paired_difference(own, turned).low == pytest.approx(0.1)
+
+
 def test_episodes_must_be_the_same():
     with pytest.raises(ValueError, match="same episodes"):
         paired_difference(sums([1, 2]), sums([1]))

@@ -11,11 +11,12 @@ import pytest
 from covis.evaluation import pictures, records
 from covis.evaluation.comparison import Entry, compared
 from covis.evaluation.experiments import Experiment
+from covis.evaluation.files import write_json
 from covis.evaluation.methods import Method
 from covis.evaluation.pictures import Page, Result, Sight
 from covis.evaluation.records import Record, summarise
 from covis.evaluation.settings import Settings
-from covis.evaluation.shards import Shards, write_json
+from covis.evaluation.shards import Shards
 from covis.evaluation.statistics import episode_sums
 
 METHODS = ("good", "<b>bold</b>", "random")
