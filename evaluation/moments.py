@@ -201,7 +201,7 @@ def _match(
     for _, source, target in pairs(frame):
         prior = prior_between(source, target) if settings.pose == "known" else None
         pair = frame.views.index(source), frame.views.index(target)
-        found[pair], _ = match_pair(**of_views(dataset.name, frame, pair, method, prior, settings, trackers))
+        found[pair], _ = match_pair(*of_views(dataset.name, frame, pair, method, prior, settings, trackers))
     return found
 
 

@@ -93,20 +93,20 @@ def of_views(
     prior: RelativePose | None,
     settings: Settings,
     trackers: PairTrackers | None,
-) -> dict[str, Any]:
-    """Arguments of `match_pair` and `attempt` for two views of a frame of the target called `name`, by their numbers."""
+) -> tuple[Any, ...]:
+    """Arguments of `match_pair` and `attempt`: two views of a frame, by their numbers; `name` is the target's."""
     source, target = (frame.views[i] for i in pair)
-    return {
-        "method": method,
-        "source": source.graph,
-        "target": target.graph,
-        "truth": PairTruth((source.identity, target.identity), true_relative_pose(source, target)),
-        "prior": prior,
-        "stream": (settings.seed, frame.index, pair[0] * len(frame.views) + pair[1]),
-        "where": f"{name}, frame {frame.index}, {source.robot} and {target.robot}",
-        "tracker": None if trackers is None else trackers.of(method.label, source.robot, target.robot),
-        "maps": None if trackers is None else trackers.maps(source.robot, target.robot),
-    }
+    return (
+        method,
+        source.graph,
+        target.graph,
+        PairTruth((source.identity, target.identity), true_relative_pose(source, target)),
+        prior,
+        (settings.seed, frame.index, pair[0] * len(frame.views) + pair[1]),
+        f"{name}, frame {frame.index}, {source.robot} and {target.robot}",
+        None if trackers is None else trackers.of(method.label, source.robot, target.robot),
+        None if trackers is None else trackers.maps(source.robot, target.robot),
+    )
 
 
 def _match_all(
@@ -125,7 +125,7 @@ def _match_all(
         raise DatasetError(f"{where}: {error}") from error
     a, b = frame.views.index(source), frame.views.index(target)
     for method in methods:
-        matching, elapsed, failure = attempt(**of_views(name, frame, (a, b), method, prior, settings, trackers))
+        matching, elapsed, failure = attempt(*of_views(name, frame, (a, b), method, prior, settings, trackers))
         record = Record.of_matching(
             matching,
             source.identity,
