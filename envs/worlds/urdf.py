@@ -50,8 +50,8 @@ def urdf_mesh(path: str, *, detail_m: float = 0.0, colors: dict[str, Color] | No
 def simplified(body: Mesh, detail_m: float) -> Mesh:
     """The mesh with all vertices in a cube of edge `detail_m` drawn together to their mean, without collapsed faces.
 
-    Unlike those of `camera.stock.simplify` the cubes lie on the grid of the body frame, whatever the mesh; v0's pictures
-    of stock robots depend on it.
+    Unlike those of `camera.stock.simplify` the cubes lie on the grid of the body frame, whatever the mesh; pictures of
+    stock robots in v0 depend on it.
     """
     if detail_m <= 0:
         return body
