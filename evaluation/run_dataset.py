@@ -85,6 +85,11 @@ def begin(trackers: PairTrackers | None, frame: Frame) -> None:
         trackers.begin(frame.episode, odometry, {view.robot: view.graph for view in frame.views})
 
 
+def _place(name: str, frame: Frame, source: View, target: View) -> str:
+    """Where in a run a pair of views is, for messages."""
+    return f"{name}, frame {frame.index}, {source.robot} and {target.robot}"
+
+
 def of_views(
     name: str,
     frame: Frame,
@@ -103,7 +108,7 @@ def of_views(
         PairTruth((source.identity, target.identity), true_relative_pose(source, target)),
         prior,
         (settings.seed, frame.index, pair[0] * len(frame.views) + pair[1]),
-        f"{name}, frame {frame.index}, {source.robot} and {target.robot}",
+        _place(name, frame, source, target),
         None if trackers is None else trackers.of(method.label, source.robot, target.robot),
         None if trackers is None else trackers.maps(source.robot, target.robot),
     )
@@ -118,11 +123,10 @@ def _match_all(
 ) -> Iterator[Matched]:
     """What each method makes of a pair of views."""
     frame, source, target = pair
-    where = f"{name}, frame {frame.index}, {source.robot} and {target.robot}"
     try:
         prior = prior_between(source, target) if settings.pose == "known" else None
     except DatasetError as error:
-        raise DatasetError(f"{where}: {error}") from error
+        raise DatasetError(f"{_place(name, frame, source, target)}: {error}") from error
     a, b = frame.views.index(source), frame.views.index(target)
     for method in methods:
         matching, elapsed, failure = attempt(*of_views(name, frame, (a, b), method, prior, settings, trackers))
