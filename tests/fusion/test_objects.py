@@ -242,3 +242,27 @@ def test_relative_poses_surer_than_the_frames_own_pose_are_refused():
     graphs, poses, full, _ = team(np.random.default_rng(3))
     with pytest.raises(ValueError, match="frame_covariance is larger"):
         fuse(graphs, poses, full, frame_covariance=np.eye(6))
+
+
+def test_of_two_that_disagree_the_more_precise_is_kept():
+    vague, precise = (
+        ObjectGraph.from_positions([[5.0, y, 0.0]], covariances=std**2 * np.eye(3)[None])
+        for y, std in ((0.0, 0.2), (3.0, 0.1))
+    )
+    still = {(0, 1): RelativePose(np.eye(4), np.zeros((6, 6)))}
+    for graphs, used in (([vague, precise], [False, True]), ([precise, vague], [True, False])):
+        fused = fuse(graphs, still, {(0, 1): matching((0, 0))}, gate=0.999)
+        assert fused.used.tolist() == [used]
+        assert fused.positions[0] == pytest.approx([5, 3, 0])
+
+
+def test_a_team_fuses_groups_that_are_consistent():
+    """Five right matches of each object overrule a wrong one, although its score is the highest."""
+    graph = ObjectGraph.from_positions([[5.0, 0.0, 0.0], [5.0, 4.0, 0.0]])
+    matchings = {(i, j): matching((0, 0), (1, 1), scores=[0.9] * 2) for i in range(4) for j in range(i + 1, 4)}
+    matchings[0, 3] = matching((0, 1), (1, 0), scores=[0.95] * 2)
+    own = fuse_team([graph] * 4, [np.eye(4)] * 4, [1e-6 * np.eye(6)] * 4, matchings)
+    assert [x.n_robots.tolist() for x in own] == [[4, 4]] * 4
+    own = fuse_team([graph] * 4, [np.eye(4), None, *[np.eye(4)] * 2], [1e-6 * np.eye(6)] * 4, matchings)
+    assert own[1] is None
+    assert own[0].n_robots.tolist() == [3, 3]

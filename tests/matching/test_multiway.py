@@ -102,6 +102,22 @@ def test_a_missing_match_is_closed_over_the_third_robot_and_scored_by_it():
     np.testing.assert_allclose(consistent(full, [1, 1, 1])[0, 2].scores, [1 - 0.5 * (1 - 0.72)])
 
 
+def test_a_chain_over_two_robots_scores_the_product_and_may_be_left_out():
+    one = np.array([[0, 0]])
+    links = {(i, i + 1): Matching(one, [s]) for i, s in enumerate((0.9, 0.8, 0.7))}
+    matchings = {**links, (0, 3): Matching.empty()}
+    np.testing.assert_allclose(consistent(matchings, [1] * 4)[0, 3].scores, [0.9 * 0.8 * 0.7])
+    assert [len(m) for m in consistent(matchings, [1] * 4, min_score=0.75).values()] == [1, 1, 0, 0]
+
+
+def test_robots_that_were_not_compared_say_nothing_against_a_match():
+    one = np.array([[0, 0]])
+    matchings = {(0, 1): Matching(one, [0.9]), (1, 2): Matching(one, [0.47])}  # odds a little above the prior's of .4
+    assert len(consistent(matchings, [1, 1, 1])[1, 2]) == 1
+    assert len(consistent({**matchings, (0, 2): Matching.empty()}, [1, 1, 1])[1, 2]) == 0
+    assert len(consistent(matchings, [1, 1, 1], match_prior=0.5)[1, 2]) == 0
+
+
 def partitions(items):
     if not items:
         yield []
