@@ -12,6 +12,7 @@ import math
 import numpy as np
 
 from .bayes_calibration import CALIBRATIONS, Evidence, calibrated, kind_of, pair_features
+from .bayes_headings import grid_log_evidence, heading_log_prior, level_heading, right_angles_given
 from .bayes_overlap import overlap_features
 from .bayes_prepare import LOG_2PI, Problem, Settings, levelling_rotation, prepare, ranges, reach_of
 from .bayes_solve import Modes, Prior, decode, mix, solve_levelled, solve_spatial
@@ -24,8 +25,8 @@ OCCLUDER = 0.017
 """Half width of what hides, as a fraction of the reach."""
 
 OCCLUDED = 0.75
-RIGHT_ANGLE_STD_RAD = math.radians(2.0)
-"""How far the headings of robots on streets or in buildings differ from a multiple of a right angle."""
+RIGHT_ANGLES = 0.2
+"""For cameras whose evidence counts whole: prior probability of headings that differ by a multiple of a right angle."""
 
 LEAST_HYPOTHESIS = 0.01
 ALTERNATIVES: tuple[tuple[float, float], ...] = ((0.2, 0.0), (4.0, 0.0), (1.0, 0.07))
@@ -47,7 +48,7 @@ def bayes(
     rng: np.random.Generator | None = None,
     min_score: float | None = None,
     common_probability: float = 0.5,
-    right_angles: float = 0.0,
+    right_angles: float | None = None,
     bearing_std_rad: float = DEFAULT_BEARING_STD_RAD,
     class_sharpness: float = 2.25,
     mislabel: float = 0.01,
@@ -77,7 +78,9 @@ def bayes(
             entry in `bayes_calibration.CALIBRATIONS`, between .21 and .43.
         common_probability: prior probability that two views show any common object; not used with a prior pose.
         right_angles: prior probability that the robots' headings differ by a multiple of a right angle, as on streets
-            and in buildings; else all headings are equally likely. Not used with a prior pose or without gravity.
+            and in buildings, before looking at how the objects lie; else all headings are equally likely. By default
+            .2 for graphs with intrinsics that do not both report covariances, and 0 for others. Not used with a prior
+            pose or without gravity.
         bearing_std_rad: error across the viewing ray of graphs without full covariances, radians.
         class_sharpness: power that turns class confidences into likelihoods.
         mislabel: share of class labels that tell nothing.
@@ -106,7 +109,8 @@ def bayes(
     if min_score is not None:
         check_interval("min_score", min_score, "[0, 1]")
     check_interval("common_probability", common_probability, "(0, 1)")
-    check_interval("right_angles", right_angles, "[0, 1)")
+    if right_angles is not None:
+        check_interval("right_angles", right_angles, "[0, 1)")
     check_interval("bearing_std_rad", bearing_std_rad, "[0, inf)")
     check_interval("class_sharpness", class_sharpness, "[0, inf)")
     check_interval("mislabel", mislabel, "[0, 1]")
@@ -171,8 +175,10 @@ def bayes(
     evidence = Evidence(np.concatenate([_features(*x) for x in explanations]), pair_features(problem))
     modes = _joined([y for _, y in explanations]) if len(explanations) > 1 else found
     modes = modes._replace(log_evidence=calibrated(evidence, calibration))
-    if right_angles > 0 and gravity and prior is None:
-        modes = modes._replace(log_evidence=modes.log_evidence + heading_log_prior(modes.R, right_angles))
+    if gravity and prior is None:
+        probability = _right_angles(right_angles, kind, source, target, problem, L_a, L_b)
+        if probability > 0:
+            modes = modes._replace(log_evidence=modes.log_evidence + heading_log_prior(modes.R, probability))
     if prior is None:
         weights, P = mix(modes, math.log(common_probability), math.log1p(-common_probability), n, m)
     else:
@@ -198,12 +204,21 @@ def bayes(
     )
 
 
-def heading_log_prior(R: Array, right_angles: float) -> Array:
-    """Log prior (k,) of levelled rotations R (k, 3, 3) about z against a uniform one; `right_angles` as in `bayes`."""
-    yaw = np.arctan2(R[:, 1, 0], R[:, 0, 0])
-    off = ((yaw + math.pi / 4) % (math.pi / 2) - math.pi / 4) / RIGHT_ANGLE_STD_RAD
-    peak = math.pi / 2 / (RIGHT_ANGLE_STD_RAD * math.sqrt(2 * math.pi))
-    return np.log(1 - right_angles + right_angles * peak * np.exp(-0.5 * off**2))
+def _right_angles(
+    before: float | None, kind: str, source: ObjectGraph, target: ObjectGraph, x: Problem, L_a: Array, L_b: Array
+) -> float:
+    """Probability that headings differ by a multiple of a right angle, after a look at how the objects lie."""
+    heading_a, heading_b = level_heading(source, L_a), level_heading(target, L_b)
+    if heading_a is None or heading_b is None:
+        return before or 0.0
+    if before is None:
+        cameras = source.intrinsics is not None and target.intrinsics is not None
+        # Weights of the other kinds were fitted without it.
+        before = RIGHT_ANGLES if cameras and kind == "whole" else 0.0
+    if before == 0.0:
+        return before
+    seen = grid_log_evidence(x.p_a, x.S_a, heading_a) + grid_log_evidence(x.p_b, x.S_b, heading_b)
+    return right_angles_given(before, seen)
 
 
 def _levelling(graph: ObjectGraph, gravity: bool) -> Array:

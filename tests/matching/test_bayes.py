@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from covis.matching import ObjectGraph, RelativePose, bayes
-from covis.matching.bayes import heading_log_prior
 from covis.matching.bayes_assignment import assignment_marginals
 from covis.matching.bayes_calibration import CALIBRATIONS, FEW, Evidence, calibrated, kind_of, pair_features
+from covis.matching.bayes_headings import grid_log_evidence, heading_log_prior, level_heading, right_angles_given
 from covis.matching.bayes_overlap import MARGIN_RAD, N_FEATURES, REACH, overlap_features
 from covis.matching.bayes_prepare import (
     Settings,
@@ -379,6 +379,48 @@ def test_robots_on_a_grid_of_streets_prefer_headings_at_right_angles():
         )
 
     assert expected(streets) < expected(plain)
+
+
+def laid_out(rng: np.random.Generator, n: int, lanes: bool) -> np.ndarray:
+    """Objects (n, 3) before a robot that looks along x: in lanes 4 m wide, or anywhere."""
+    y = 4.0 * rng.integers(-2, 3, n) if lanes else rng.uniform(-10, 10, n)
+    return np.c_[rng.uniform(5, 60, n), y + 0.1 * rng.standard_normal(n), np.full(n, -1.0)]
+
+
+def test_objects_in_lanes_tell_of_a_grid_and_scattered_ones_against_it():
+    forward = np.array([1.0, 0.0])
+    S = np.tile(0.04 * np.eye(3), (11, 1, 1))
+
+    def evidence(seed, lanes, turn=0.0, scale=1.0):
+        p = np.r_[laid_out(np.random.default_rng(seed), 10, lanes), np.zeros((1, 3))] @ rotation_z(turn).T
+        return grid_log_evidence(p, scale * S, forward)
+
+    in_lanes, scattered = (np.array([evidence(s, lanes) for s in range(40)]) for lanes in (True, False))
+    assert in_lanes.mean() > 1.0 > 0.0 > scattered.mean()
+    assert np.mean([evidence(s, True, turn=np.pi / 4) for s in range(40)]) < 0.0
+    quarter = [evidence(s, True, turn=np.pi / 2) for s in range(40)]
+    np.testing.assert_allclose(quarter, in_lanes, atol=1e-9)
+    assert evidence(0, True, scale=1e6) == 0.0
+    np.testing.assert_allclose(right_angles_given(0.2, np.log(4.0)), 0.5)
+    assert right_angles_given(0.2, -1e9) == 0.0
+
+
+def test_cameras_among_objects_in_lanes_expect_right_angles_and_others_do_not():
+    rng = np.random.default_rng(5)
+    R_camera = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    K = np.array([[320.0, 0, 320], [0, 320, 240], [0, 0, 1]])
+    here, there = laid_out(rng, 9, lanes=True), laid_out(rng, 9, lanes=True)
+    there[:3] = (here[:3] - [2.0, 3.0, 0.0]) @ rotation_z(0.5)
+
+    def evidence(cameras, **options):
+        more = {"intrinsics": K, "image_size": (640, 480)} if cameras else {}
+        a, b = (graph(X @ R_camera, R_camera.T @ UP, position_variance=0.5, **more) for X in (here, there))
+        return bayes(a, b, **options).diagnostics["log_evidence"]
+
+    assert evidence(True) == evidence(True, right_angles=0.2) != evidence(True, right_angles=0.0)
+    assert evidence(False) == evidence(False, right_angles=0.0)
+    looks_up = ObjectGraph.from_positions(here, up=(0, 0, 1), forward=(0, 0, 1))
+    assert level_heading(looks_up, np.eye(3)) is None
 
 
 @pytest.mark.parametrize(
