@@ -383,8 +383,8 @@ def test_robots_on_a_grid_of_streets_prefer_headings_at_right_angles():
 
 def laid_out(rng: np.random.Generator, n: int, lanes: bool) -> np.ndarray:
     """Objects (n, 3) before a robot that looks along x: in lanes 4 m wide, or anywhere."""
-    y = 4.0 * rng.integers(-2, 3, n) if lanes else rng.uniform(-10, 10, n)
-    return np.c_[rng.uniform(5, 60, n), y + 0.1 * rng.standard_normal(n), np.full(n, -1.0)]
+    y = 4.0 * rng.integers(-2, 3, n) if lanes else rng.uniform(-20, 20, n)
+    return np.c_[rng.uniform(5, 45, n), y + 0.1 * rng.standard_normal(n), np.full(n, -1.0)]
 
 
 def test_objects_in_lanes_tell_of_a_grid_and_scattered_ones_against_it():
@@ -402,7 +402,7 @@ def test_objects_in_lanes_tell_of_a_grid_and_scattered_ones_against_it():
     np.testing.assert_allclose(quarter, in_lanes, atol=1e-9)
     assert evidence(0, True, scale=1e6) == 0.0
     np.testing.assert_allclose(right_angles_given(0.2, np.log(4.0)), 0.5)
-    assert right_angles_given(0.2, -1e9) == 0.0
+    assert right_angles_given(0.2, -1e9) < 1e-200
 
 
 def test_cameras_among_objects_in_lanes_expect_right_angles_and_others_do_not():
