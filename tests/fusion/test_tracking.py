@@ -142,6 +142,15 @@ def test_classes_keep_tracks_apart():
     assert a[0] == c[0] != b[0]
 
 
+def test_a_track_without_a_class_takes_that_of_its_next_measurement():
+    tracker = Tracker(options())
+    here, C = np.zeros((1, 3)), 0.01 * np.eye(3)[None]
+    unknown = tracker.update(Batch(0.0, here, C))
+    first = tracker.update(Batch(0.1, here, C, np.array([1])))
+    second = tracker.update(Batch(0.2, here, C, np.array([2])))
+    assert unknown[0] == first[0] != second[0]
+
+
 def test_prediction_to_a_later_time():
     C = np.tile(0.01 * np.eye(3), (1, 1, 1))
     tracker = Tracker(options())
