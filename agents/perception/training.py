@@ -133,7 +133,7 @@ def _json_logger(path: Path) -> Callable[[dict[str, Any]], None]:
 
 
 def _tensorboard(out: Path) -> list[Callable[[dict[str, Any]], None]]:
-    """A logger for TensorBoard, where that is installed."""
+    """A logger for TensorBoard, where that is installed (`covis[training]`)."""
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:

@@ -242,6 +242,16 @@ def test_validation_and_rows_of_progress(tmp_path):
     assert len((tmp_path / "training.jsonl").read_text().splitlines()) == len(rows)
 
 
+def test_progress_goes_to_tensorboard(tmp_path):
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    rows = []
+    train(quick(steps=2), tmp_path, network=tiny(), report=rows.append, report_s=0)
+    logged = accumulator.EventAccumulator(str(tmp_path / "tensorboard"))
+    logged.Reload()
+    losses = [(event.step, event.value) for event in logged.Scalars("total")]
+    assert losses == [(row["step"], pytest.approx(row["total"], rel=1e-6)) for row in rows]
+
+
 def test_the_learning_rate_rises_and_falls():
     rates = [schedule(x, 0.1) for x in np.linspace(0, 1, 101)]
     assert np.argmax(rates) == 10
