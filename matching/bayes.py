@@ -14,7 +14,7 @@ import numpy as np
 from .bayes_calibration import CALIBRATIONS, Evidence, calibrated, kind_of, pair_features
 from .bayes_headings import grid_log_evidence, heading_log_prior, level_heading, right_angles_given
 from .bayes_overlap import overlap_features
-from .bayes_prepare import LOG_2PI, Problem, Settings, levelling_rotation, prepare, ranges, reach_of
+from .bayes_prepare import HALF_LENGTH, LOG_2PI, Problem, Settings, levelling_rotation, prepare, ranges, reach_of
 from .bayes_solve import Modes, Prior, decode, mix, solve_levelled, solve_spatial
 from .bayes_view import View
 from .checks import check_count, check_interval
@@ -27,6 +27,9 @@ OCCLUDER = 0.017
 OCCLUDED = 0.75
 RIGHT_ANGLES = 0.2
 """For cameras whose evidence counts whole: prior probability of headings that differ by a multiple of a right angle."""
+
+APART = 1.4
+"""Least distance between the middles of two objects, in half lengths: they do not overlap."""
 
 LEAST_HYPOTHESIS = 0.01
 ALTERNATIVES: tuple[tuple[float, float], ...] = ((0.2, 0.0), (4.0, 0.0), (1.0, 0.07))
@@ -139,12 +142,13 @@ def bayes(
         depth_offset_std=float(depth_offset_std),
         scale_std=float(scale_std),
         robot_extent=0.031,
+        apart=APART,
     )
     if source.covariances is not None and target.covariances is not None:
         q = q._replace(extent=REPORTED_EXTENT * q.extent)
     gravity = source.up is not None and target.up is not None
     L_a, L_b = _levelling(source, gravity), _levelling(target, gravity)
-    view_a, view_b = _views(source, target, L_a, L_b, float(detection))
+    view_a, view_b = _views(source, target, L_a, L_b, float(detection), q.depth_offset)
 
     seen = view_a.known > 0 and view_b.known > 0
     kind = kind_of(source, target, gravity, seen, prior is not None)
@@ -256,15 +260,19 @@ def _arrays(graph: ObjectGraph, scale: float) -> tuple[Array, Array, Array, Arra
     return tuple(np.ascontiguousarray(x) for x in arrays)  # type: ignore[return-value]
 
 
-def _views(source: ObjectGraph, target: ObjectGraph, L_a: Array, L_b: Array, detection: float) -> tuple[View, View]:
+def _views(
+    source: ObjectGraph, target: ObjectGraph, L_a: Array, L_b: Array, detection: float, depth_offset: float
+) -> tuple[View, View]:
     distance = ranges(np.ascontiguousarray(source.positions), np.ascontiguousarray(target.positions))
     reach = float(reach_of(distance))
     planes = [_view_planes(source), _view_planes(target)]
     known = float(planes[0] is not None and planes[1] is not None)
+    images = all(g.intrinsics is not None and g.covariances is None for g in (source, target))
+    half_length = HALF_LENGTH * depth_offset * reach if images else 0.0
     views = []
     for normals, L in zip(planes, (L_a, L_b), strict=True):
         turned = np.zeros((0, 3)) if normals is None else np.ascontiguousarray(normals @ L.T)
-        views.append(View(known, turned, reach, detection, OCCLUDER * reach, OCCLUDED))
+        views.append(View(known, turned, reach, detection, OCCLUDER * reach, OCCLUDED, half_length))
     return views[0], views[1]
 
 

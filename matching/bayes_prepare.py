@@ -17,8 +17,8 @@ LOG_2PI = float(np.log(2 * np.pi))
 REACH_QUANTILE = 0.85
 """Share of the detections that lie within the reach."""
 
-CUT_OFF = 2.0
-"""Half of an object's length, in near-face offsets: nearer to the border of an image, part of it may be missing."""
+HALF_LENGTH = 2.0
+"""Half of an object's length, in near-face offsets."""
 
 
 @njit(cache=True)
@@ -291,6 +291,7 @@ class Settings(NamedTuple):
     depth_offset_std: float
     scale_std: float
     robot_extent: float
+    apart: float
 
 
 class Problem(NamedTuple):
@@ -306,6 +307,7 @@ class Problem(NamedTuple):
         height: m, expected height of the target's frame above the source's; height_variance: m^2.
         room_a, room_b: area (m^2), or without gravity volume (m^3), over which detections spread.
         median_range: m.
+        apart: m, least distance between the middles of two objects; 0 = unknown.
     """
 
     p_a: Array
@@ -322,6 +324,7 @@ class Problem(NamedTuple):
     room_a: float
     room_b: float
     median_range: float
+    apart: float
 
 
 @njit(cache=True)
@@ -427,12 +430,14 @@ def prepare(
     distance = ranges(positions_a, positions_b)
     median_range = max(distance[(n + m) // 2], 1e-3)
     reach = reach_of(distance)
+    reported = len(covariances_a) > 0 or len(covariances_b) > 0
+    half_length = HALF_LENGTH * q.depth_offset * reach if cameras and not reported else 0.0
     if cameras:
         allow_for_extent(p_a, S_a, q.extent * reach, q.depth_offset * reach)
         allow_for_extent(p_b, S_b, q.extent * reach, q.depth_offset * reach)
-        if len(covariances_a) == 0 and len(covariances_b) == 0:
-            allow_for_border(p_a, S_a, planes_a, CUT_OFF * q.depth_offset * reach)
-            allow_for_border(p_b, S_b, planes_b, CUT_OFF * q.depth_offset * reach)
+        if not reported:
+            allow_for_border(p_a, S_a, planes_a, half_length)
+            allow_for_border(p_b, S_b, planes_b, half_length)
     likely = np.full((n + 1, m + 1), -1e9)
     attributes = np.zeros((n, m))
     top_a, top_b = np.zeros(n, np.int64), np.zeros(m, np.int64)
@@ -488,7 +493,21 @@ def prepare(
     if scaled:
         precision[len(classes) :] = 1.0 / q.scale_std**2
     return Problem(
-        p_a, S_a, B_a, p_b, S_b, B_b, precision, static, likely, height, height_variance, room_a, room_b, median_range
+        p_a,
+        S_a,
+        B_a,
+        p_b,
+        S_b,
+        B_b,
+        precision,
+        static,
+        likely,
+        height,
+        height_variance,
+        room_a,
+        room_b,
+        median_range,
+        q.apart * half_length,
     )
 
 
@@ -506,15 +525,17 @@ def allow_for_extent(p: Array, S: Array, extent: float, offset: float) -> None:
 
 
 @njit(cache=True)
-def allow_for_border(p: Array, S: Array, planes: Array, reach: float) -> None:
-    """Widen detections nearer than `reach` (m) to the border of the view: what lies beyond it is missing.
+def allow_for_border(p: Array, S: Array, planes: Array, half_length: float) -> None:
+    """Push detections near the border of the view outwards and widen them: what lies beyond it is missing.
 
-    The middle of what is left lies up to `reach` less its own distance from the border inside of the object's.
+    The middle of what is left lies up to the object's half length (m) less its own distance from the border inside of
+    the object's: that much if the object is seen lengthwise, nothing if it is short. Both are a deviation away.
     """
     for k in range(len(planes)):
         for i in range(len(p)):
             inside = planes[k, 0] * p[i, 0] + planes[k, 1] * p[i, 1] + planes[k, 2] * p[i, 2]
-            beyond = max(reach - max(inside, 0.0), 0.0)
+            half = 0.5 * max(half_length - max(inside, 0.0), 0.0)
             for a in range(3):
+                p[i, a] -= half * planes[k, a]
                 for b in range(3):
-                    S[i, a, b] += beyond * beyond * planes[k, a] * planes[k, b]
+                    S[i, a, b] += half * half * planes[k, a] * planes[k, b]

@@ -24,6 +24,7 @@ class View(NamedTuple):
         detection: probability of detecting an object close by in plain view.
         occluder: m, half width of what hides.
         occluded: factor on the probability behind another detection.
+        half_length: m, half an object's length: beyond the border of the view a part of it is seen; 0 = unknown.
     """
 
     known: float
@@ -32,6 +33,7 @@ class View(NamedTuple):
     detection: float
     occluder: float
     occluded: float
+    half_length: float
 
 
 @njit(cache=True)
@@ -43,9 +45,10 @@ def detection_probability(x: float, y: float, z: float, view: View, detections: 
     for k in range(len(view.planes)):
         margin = min(margin, (view.planes[k, 0] * x + view.planes[k, 1] * y + view.planes[k, 2] * z) / r)
     far = (r / view.half_range - 1.0) / RANGE_SOFTNESS
-    if margin < -8.0 * EDGE_RAD or far > 8.0:
+    edge = EDGE_RAD + 0.5 * view.half_length / r
+    if margin < -8.0 * edge or far > 8.0:
         return LEAST_PROBABILITY
-    p = view.detection / ((1.0 + np.exp(-margin / EDGE_RAD)) * (1.0 + np.exp(far)))
+    p = view.detection / ((1.0 + np.exp(-margin / edge)) * (1.0 + np.exp(far)))
     gap = 1e300
     for k in range(len(detections) - 1):
         u, v, w = detections[k, 0], detections[k, 1], detections[k, 2]
