@@ -388,18 +388,19 @@ def test_what_can_only_be_one_object_is_likelier_matched(monkeypatch):
     others = np.c_[np.linspace(20, 60, 7), [5.0, -9.0, 12.0, 0.0, -14.0, 10.0, -3.0], np.full(7, -1.0)]
     prior = RelativePose(np.eye(4), 1e-4 * np.eye(6))
 
-    def probability(reported):
+    def log_odds(reported):
         graphs = []
         for y in (0.0, 1.2):
             X = np.r_[[[9.0, y, -1.0]], others]
             g = graph(X @ R_camera, R_camera.T @ UP, position_variance=0.02, intrinsics=K, image_size=(640, 480))
             graphs.append(replace(g, covariances=g.full_covariances()) if reported else g)
-        return bayes(*graphs, prior=prior).diagnostics["probabilities"][0, 0]
+        P = bayes(*graphs, prior=prior).diagnostics["probabilities"][0, 0]
+        return np.log(P) - np.log1p(-P)
 
-    with_core = [probability(reported) for reported in (False, True)]
+    with_core = [log_odds(reported) for reported in (False, True)]
     monkeypatch.setattr(import_module("covis.matching.bayes"), "APART", 0.0)
-    without = [probability(reported) for reported in (False, True)]
-    assert without[0] < 0.5 < with_core[0]
+    without = [log_odds(reported) for reported in (False, True)]
+    assert with_core[0] > without[0] + 1.0
     assert with_core[1] == without[1]
 
 
