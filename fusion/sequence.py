@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..matching.bayes import bayes
 from ..matching.bayes_solve import decode
 from ..matching.checks import check_count, check_interval
 from ..matching.graph import Matcher, Matching, ObjectGraph
@@ -146,7 +147,13 @@ class PairTracker:
         rng: np.random.Generator | None = None,
         **options: Any,
     ) -> Matching:
-        """This frame's matching, after `predict`; `maps` are all that either robot remembers (`LocalMap.see`)."""
+        """This frame's matching, after `predict`; `maps` are all that either robot remembers (`LocalMap.see`).
+
+        `bayes` is asked without its prior of right-angled headings, unless `right_angles` is given: the prior would
+        count again with every frame.
+        """
+        if matcher is bayes:
+            options = {"right_angles": 0.0} | options
         alone = matcher(source, target, prior=None, rng=rng, **options)
         if source.up is None or target.up is None:
             return alone

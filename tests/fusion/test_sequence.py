@@ -12,6 +12,7 @@ from covis.fusion.posefilter import (
 )
 from covis.fusion.registration import log_se3
 from covis.fusion.sequence import PairOptions, PairTracker, propose
+from covis.matching.bayes import bayes
 from covis.matching.graph import Hypothesis, Matching, ObjectGraph
 from covis.matching.pose import RelativePose, exp_se3, invert, rotation_from_vector, transform
 
@@ -236,6 +237,25 @@ def test_graphs_without_gravity_are_matched_frame_by_frame():
     for _ in range(3):
         tracker.predict()
         assert len(tracker.match(matcher, plain, plain)) == 0
+
+
+def test_right_angles_do_not_count_again_with_every_frame():
+    rng = np.random.default_rng(5)
+    R_camera = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    K = np.array([[320.0, 0, 320], [0, 320, 240], [0, 0, 1]])
+    lanes = np.c_[rng.uniform(5, 45, 9), 4.0 * rng.integers(-2, 3, 9), np.full(9, -1.0)]
+    other = np.r_[(lanes[:3] - [2.0, 3.0, 0.0]) @ rotation_from_vector(np.array([0, 0, 0.5])), lanes[::-1][:5]]
+    camera = {"up": R_camera.T @ Z_UP, "intrinsics": K, "image_size": (640, 480), "position_variance": 0.5}
+    a, b = (ObjectGraph.from_positions(X @ R_camera, **camera) for X in (lanes, other))
+
+    def evidence(**options):
+        tracker = PairTracker()
+        tracker.predict()
+        return tracker.match(bayes, a, b, **options).diagnostics["log_evidence"]
+
+    plain = bayes(a, b, right_angles=0.0).diagnostics["log_evidence"]
+    assert evidence() == plain != bayes(a, b).diagnostics["log_evidence"]
+    assert evidence(right_angles=0.2) == bayes(a, b).diagnostics["log_evidence"]
 
 
 def test_poses_that_a_matching_stands_for():
