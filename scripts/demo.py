@@ -17,11 +17,14 @@ def demo(
     seed: Annotated[int, typer.Option(help="Of scenes, eyes and matchers.")] = 0,
 ) -> None:
     """Scenes x methods, from pixels to displacement error: a table here, a report with pictures in a folder."""
+    made = not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with progress_bar("demo") as progress:
             rows = run_demo(folder, seed, progress)
     except (ValueError, RuntimeError, OSError) as error:
+        if made and folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
         fail(error)
     print_benchmark(rows)
     out.print(f"Report with pictures: {folder / 'report.md'}", soft_wrap=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,13 @@ import pyarrow.parquet as pq
 import pytest
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@pytest.fixture(autouse=True)
+def _own_modules_are_forgotten():
+    """A test's `mine.py` is not the next test's: commands run in one process here."""
+    yield
+    sys.modules.pop("mine", None)
 
 
 @pytest.fixture
