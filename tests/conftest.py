@@ -19,6 +19,8 @@ def _own_modules_are_forgotten():
     """A test's `mine.py` is not the next test's: commands run in one process here."""
     yield
     sys.modules.pop("mine", None)
+    if methods := sys.modules.get("covis.evaluation.methods"):
+        methods._loaded.cache_clear()
 
 
 @pytest.fixture
