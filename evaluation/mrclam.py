@@ -19,26 +19,15 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from ..matching.pose import Array, invert, transform
+from . import dataset_tables
 from .dataset_schemas import DETECTIONS, ROBOTS, columns
-from .dataset_tables import FORMAT, VERSION
 from .mrclam_files import MrclamError, RawSequence, RobotLog, read_sequence
 from .mrclam_odometry import Track, pose_at, states_at
 
 MAX_TRUTH_GAP_S = 2.5
 """Longest gap between motion-capture samples that is bridged, s."""
 ROBOT_COLUMNS = ("frame", "time", "robot", "episode", "pose", "pose_truth", "odometry")
-DETECTION_COLUMNS = (
-    "frame",
-    "robot",
-    "detection",
-    "identity",
-    "position",
-    "position_variance",
-    "attribute",
-    "attribute_variance",
-    "covariance",
-    "truth",
-)
+DETECTION_COLUMNS = (*dataset_tables.DETECTION_COLUMNS, "covariance", "truth")
 
 
 @dataclass(frozen=True)
@@ -221,8 +210,8 @@ def _subject_truth(subject: int, time: float, raw: RawSequence) -> list[float] |
 def _meta(name: str, robots: list[RobotLog], window: float) -> dict[str, object]:
     bearings = np.concatenate([robot.readings[:, 3] for robot in robots])
     return {
-        "format": FORMAT,
-        "version": VERSION,
+        "format": dataset_tables.FORMAT,
+        "version": dataset_tables.VERSION,
         "name": name,
         "classes": ["object"],
         "sensor_frame": "robot: x forward, y left, z up",

@@ -14,7 +14,7 @@ import numpy as np
 from .bayes_calibration import CALIBRATIONS, Evidence, calibrated, kind_of, pair_features
 from .bayes_headings import grid_log_evidence, heading_log_prior, level_heading, right_angles_given
 from .bayes_overlap import overlap_features
-from .bayes_prepare import HALF_LENGTH, LOG_2PI, Problem, Settings, levelling_rotation, prepare, ranges, reach_of
+from .bayes_prepare import LOG_2PI, Problem, Settings, levelling_rotation, prepare, ranges, reach_of
 from .bayes_solve import Modes, Prior, decode, mix, solve_levelled, solve_spatial
 from .bayes_view import View
 from .checks import check_count, check_interval
@@ -28,8 +28,8 @@ OCCLUDED = 0.75
 RIGHT_ANGLES = 0.2
 """For cameras whose evidence counts whole: prior probability of headings that differ by a multiple of a right angle."""
 
-APART = 1.4
-"""Least distance between the middles of two objects, in half lengths: they do not overlap."""
+HALF_LENGTH = 2.0
+"""Half of an object's length, in near-face offsets."""
 
 LEAST_HYPOTHESIS = 0.01
 ALTERNATIVES: tuple[tuple[float, float], ...] = ((0.2, 0.0), (4.0, 0.0), (1.0, 0.07))
@@ -142,7 +142,6 @@ def bayes(
         depth_offset_std=float(depth_offset_std),
         scale_std=float(scale_std),
         robot_extent=0.031,
-        apart=APART,
     )
     if source.covariances is not None and target.covariances is not None:
         q = q._replace(extent=REPORTED_EXTENT * q.extent)
@@ -166,6 +165,7 @@ def bayes(
             seen,
             view_a.planes,
             view_b.planes,
+            view_a.half_length,
             q._replace(scale_std=depth_scale_std),
         )
         solve = solve_levelled if gravity else solve_spatial

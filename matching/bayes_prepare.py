@@ -17,9 +17,6 @@ LOG_2PI = float(np.log(2 * np.pi))
 REACH_QUANTILE = 0.85
 """Share of the detections that lie within the reach."""
 
-HALF_LENGTH = 2.0
-"""Half of an object's length, in near-face offsets."""
-
 
 @njit(cache=True)
 def levelling_rotation(up: Array) -> Array:
@@ -291,7 +288,6 @@ class Settings(NamedTuple):
     depth_offset_std: float
     scale_std: float
     robot_extent: float
-    apart: float
 
 
 class Problem(NamedTuple):
@@ -307,7 +303,6 @@ class Problem(NamedTuple):
         height: m, expected height of the target's frame above the source's; height_variance: m^2.
         room_a, room_b: area (m^2), or without gravity volume (m^3), over which detections spread.
         median_range: m.
-        apart: m, least distance between the middles of two objects; 0 = unknown.
     """
 
     p_a: Array
@@ -324,7 +319,6 @@ class Problem(NamedTuple):
     room_a: float
     room_b: float
     median_range: float
-    apart: float
 
 
 @njit(cache=True)
@@ -416,12 +410,13 @@ def prepare(
     seen: bool,
     planes_a: Array,
     planes_b: Array,
+    half_length: float,
     q: Settings,
 ) -> Problem:
     """Assemble the problem.
 
     `cameras`: detections come from images: biased depth, objects of some extent, cut off at the `planes` (2, 3) that
-    bound the field of view (inward normals, levelled; (0, 3) = unknown).
+    bound the field of view (inward normals, levelled; (0, 3) = unknown) where their `half_length`, m, is not 0.
     """
     n, m = len(positions_a), len(positions_b)
     p_a, S_a, p_b, S_b = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((m, 3)), np.empty((m, 3, 3))
@@ -430,12 +425,10 @@ def prepare(
     distance = ranges(positions_a, positions_b)
     median_range = max(distance[(n + m) // 2], 1e-3)
     reach = reach_of(distance)
-    reported = len(covariances_a) > 0 or len(covariances_b) > 0
-    half_length = HALF_LENGTH * q.depth_offset * reach if cameras and not reported else 0.0
     if cameras:
         allow_for_extent(p_a, S_a, q.extent * reach, q.depth_offset * reach)
         allow_for_extent(p_b, S_b, q.extent * reach, q.depth_offset * reach)
-        if not reported:
+        if half_length > 0:
             allow_for_border(p_a, S_a, planes_a, half_length)
             allow_for_border(p_b, S_b, planes_b, half_length)
     likely = np.full((n + 1, m + 1), -1e9)
@@ -507,7 +500,6 @@ def prepare(
         room_a,
         room_b,
         median_range,
-        q.apart * half_length,
     )
 
 

@@ -12,7 +12,6 @@ import math
 import numpy as np
 from numba import njit
 
-from .bayes_apart import log_apart
 from .bayes_assignment import assignment_marginals
 from .bayes_prepare import Settings
 from .bayes_view import View, detection_probability
@@ -318,7 +317,6 @@ def refine(
     prior_t: Array,
     prior_precision: Array,
     prior_log_norm: float,
-    apart: float,
     R: Array,
     t: Array,
     bias: Array,
@@ -333,8 +331,7 @@ def refine(
 ) -> float:
     """Climb to the mode nearest to (R, t, bias), in place; returns its log evidence against "nothing in common".
 
-    Fills marginals (n, m), the probability of every match under this mode, and information (d, d). `apart` (m) as in
-    `Problem`.
+    Fills marginals (n, m), the probability of every match under this mode, and information (d, d).
     """
     n, m, nb = len(p_a), len(p_b), len(bias)
     d = nr + 3 + nb
@@ -350,7 +347,6 @@ def refine(
     n0, m0 = n - 1, m - 1
     seen = view_a.known > 0 and view_b.known > 0
     bonus_a, bonus_b, shared_a, shared_b = np.zeros(n), np.zeros(m), np.zeros(n), np.zeros(m)
-    weighed, separate = static, np.empty((n, m))
     for iteration in range(max_iterations + 1):
         void = 0.0
         shared_a[:] = log_odds
@@ -358,9 +354,6 @@ def refine(
             R_inverse = np.ascontiguousarray(R.T)
             void = seen_by_other(p_a, R_inverse, -(R_inverse @ t), view_b, p_b, q.view_bonus, bonus_a, shared_a)
             void += seen_by_other(p_b, R, t, view_a, p_a, q.view_bonus, bonus_b, shared_b)
-        if apart > 0:
-            void += log_apart(p_a, S_a, B_a, p_b, S_b, B_b, R, t, bias, apart, separate)
-            weighed = static - separate
         temper = tempers[min(iteration, len(tempers) - 1)]
         n_edges = residual_edges(
             p_a,
@@ -369,7 +362,7 @@ def refine(
             p_b,
             S_b,
             B_b,
-            weighed,
+            static,
             R,
             t,
             bias,
@@ -430,8 +423,9 @@ def refine(
             for a in range(d):
                 half_logdet += np.log(factor[a, a])
             evidence = log_z - penalty + prior_log_norm + 0.5 * d * LOG_2PI - half_logdet
-            evidence += void
-            if not seen:
+            if seen:
+                evidence += void
+            else:
                 evidence += overlap_log_prior(common, n0, m0, q) - log_odds * common
             break
         if iteration >= 1:

@@ -147,7 +147,6 @@ def climb(x: Problem, prior: Prior, view_a: View, view_b: View, q: Settings, tur
             prior.t,
             precision,
             log_norm,
-            x.apart,
             R[k],
             t[k],
             bias[k],

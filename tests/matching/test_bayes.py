@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from importlib import import_module
 from itertools import combinations, permutations
 
 import numpy as np
 import pytest
 
 from covis.matching import ObjectGraph, RelativePose, bayes
-from covis.matching.bayes_apart import LEAST_APART, log_apart
 from covis.matching.bayes_assignment import assignment_marginals
 from covis.matching.bayes_calibration import CALIBRATIONS, FEW, Evidence, calibrated, kind_of, pair_features
 from covis.matching.bayes_headings import grid_log_evidence, heading_log_prior, level_heading, right_angles_given
@@ -330,14 +328,14 @@ def test_an_object_cut_off_by_the_border_of_an_image_is_matched():
 
 def test_lengths_of_objects_do_not_follow_a_few_near_ones():
     """Near faces lie as far from the middles, and the robots are as large, when most of the objects come near."""
-    q = Settings(2.25, 0.01, 4.0, 3.0, 0.8, 1.2, 1.5, 0.008, 0.03, 0.012, 0.0, 0.03, 1.4)
+    q = Settings(2.25, 0.01, 4.0, 3.0, 0.8, 1.2, 1.5, 0.008, 0.03, 0.012, 0.0, 0.03)
     far, near = np.linspace(30.0, 60.0, 10), np.linspace(30.0, 60.0, 10)
     near[:6] = np.linspace(3.0, 8.0, 6)
 
     def prepared(ranges):
         p = np.c_[ranges, np.zeros(10), np.zeros(10)]
         side = p, np.full(10, 0.1), np.empty((0, 3, 3)), np.ones((10, 1)), np.zeros(10), np.eye(3)
-        return prepare(*side, *side, 0.007**2, True, True, False, np.empty((0, 3)), np.empty((0, 3)), q)
+        return prepare(*side, *side, 0.007**2, True, True, False, np.empty((0, 3)), np.empty((0, 3)), 0.0, q)
 
     a, b = prepared(far), prepared(near)
     assert b.median_range < 0.6 * a.median_range
@@ -355,53 +353,6 @@ def test_border_of_the_view_moves_and_widens_only_what_is_near_it_and_only_acros
     np.testing.assert_allclose(p, [[5.0, 0.5 - 0.5, 0.0], [5.0, -0.3 - 0.75, 0.0], [5.0, 2.0, 0.0]])
     np.testing.assert_allclose(S[:, 1, 1], [1 + 0.5**2, 1 + 0.75**2, 1.0])
     np.testing.assert_allclose(S[:, [0, 2], [0, 2]], 1.0)
-
-
-def test_objects_do_not_overlap():
-    """Two objects where one has its place are rare; vague detections, and robots beside objects, say nothing."""
-    apart, none, no_bias = 3.0, np.zeros((2, 0, 3)), np.zeros(0)
-
-    def rarer(shift, std, robots=100.0):
-        a, b = np.zeros((2, 3)), np.zeros((2, 3))
-        a[0, 0], b[0, 0] = 50.0, 50.0 - robots + shift
-        S = np.tile(0.5 * std**2 * np.eye(3), (2, 1, 1))
-        out = np.full((2, 2), np.nan)
-        total = log_apart(a, S, none, b, S, none, np.eye(3), np.array([robots, 0.0, 0.0]), no_bias, apart, out)
-        assert total == pytest.approx(out.sum())
-        assert out[0, 1] == out[1, 0] == 0.0
-        return np.exp(out)
-
-    rng = np.random.default_rng(5)
-    for shift, std in ((0.0, 0.4), (2.0, 0.4), (3.0, 0.4), (4.0, 0.4), (1.0, 3.0), (0.0, 6.0)):
-        true = np.array([shift, 0.0, 0.0]) + std * rng.standard_normal((20000, 3))
-        beyond = (np.linalg.norm(true, axis=1) > apart).mean()
-        assert rarer(shift, std)[0, 0] == pytest.approx(LEAST_APART + (1 - LEAST_APART) * beyond, abs=0.12)
-    assert rarer(20.0, 0.4)[0, 0] == 1.0
-    assert rarer(9.0, 0.4, robots=0.5)[1, 1] < 1.2 * LEAST_APART
-    assert rarer(9.0, 0.4, robots=6.0)[1, 1] > 0.99
-
-
-def test_what_can_only_be_one_object_is_likelier_matched(monkeypatch):
-    """Only for cameras that say nothing of the errors of their images: the others are taken at their word."""
-    R_camera = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
-    K = np.array([[320.0, 0, 320], [0, 320, 240], [0, 0, 1]])
-    others = np.c_[np.linspace(20, 60, 7), [5.0, -9.0, 12.0, 0.0, -14.0, 10.0, -3.0], np.full(7, -1.0)]
-    prior = RelativePose(np.eye(4), 1e-4 * np.eye(6))
-
-    def log_odds(reported):
-        graphs = []
-        for y in (0.0, 1.2):
-            X = np.r_[[[9.0, y, -1.0]], others]
-            g = graph(X @ R_camera, R_camera.T @ UP, position_variance=0.02, intrinsics=K, image_size=(640, 480))
-            graphs.append(replace(g, covariances=g.full_covariances()) if reported else g)
-        P = bayes(*graphs, prior=prior).diagnostics["probabilities"][0, 0]
-        return np.log(P) - np.log1p(-P)
-
-    with_core = [log_odds(reported) for reported in (False, True)]
-    monkeypatch.setattr(import_module("covis.matching.bayes"), "APART", 0.0)
-    without = [log_odds(reported) for reported in (False, True)]
-    assert with_core[0] > without[0] + 1.0
-    assert with_core[1] == without[1]
 
 
 def test_a_near_object_is_seen_beyond_the_border_of_the_view():
@@ -616,12 +567,12 @@ def test_pair_features():
     (a, _, _), (b, _, _) = scene(rng, common=6, alone=3)
 
     def features(a, b):
-        q = Settings(2.25, 0.01, 4.0, 3.0, 0.8, 1.2, 1.5, 0.013, 0.035, 0.015, 0.0, 0.04, 1.4)
+        q = Settings(2.25, 0.01, 4.0, 3.0, 0.8, 1.2, 1.5, 0.013, 0.035, 0.015, 0.0, 0.04)
         none, unbounded = np.empty((0, 3, 3)), np.empty((0, 3))
         sides = [
             (g.positions, g.position_variance, none, g.attributes, g.attribute_variance, np.eye(3)) for g in (a, b)
         ]
-        return pair_features(prepare(*sides[0], *sides[1], 0.007**2, True, False, False, unbounded, unbounded, q))
+        return pair_features(prepare(*sides[0], *sides[1], 0.007**2, True, False, False, unbounded, unbounded, 0.0, q))
 
     known, swapped = features(a, b), features(b, a)
     np.testing.assert_allclose(known, swapped, atol=1e-9)
